@@ -1,0 +1,572 @@
+//! Branch-sparse block LU of the Newton matrix, O(s³ Σ depth²): the practical choice for robots.
+//!
+//! The block `J_ij` (s x s) is non-zero only when `i` and `j` lie on one branch. Eliminating leaves first creates no fill-in,
+//! because all coordinates that meet a leaf's row or column lie on its own branch:
+//!
+//! ```text
+//! factor  for i = n..1:   D_i = J_ii⁻¹;   J_ib := D_i J_ib  (b in anc i);   J_ab -= J_ai J_ib  (a, b in anc i)
+//! solve   for i = n..1:   y_i = D_i y_i;  y_a -= J_ai y_i      then for i = 1..n:  y_i -= Σ_b J_ib y_b
+//! Jᵀ      for i = n..1:   y_b -= J_ibᵀ y_i                     then for i = 1..n:  y_i = D_iᵀ (y_i - Σ_a J_aiᵀ y_a)
+//! ```
+//!
+//! Storage: for every coordinate a *row panel* (its block row along its branch, root first) and a *column panel* (its block
+//! column, transposed). The branch of an ancestor is a prefix of the branch of its descendant, so every update is a
+//! contiguous rank-s update. A floating base is the common root: its `6 s` rows and columns are eliminated last, by dense
+//! LU with pivoting.
+//!
+//! The pivots `D_i` are those of Algorithm B.1 ([`crate::recursive_newton`]): both perform the same elimination.
+//! Source: sparsity along branches, R. Featherstone, *Rigid Body Dynamics Algorithms*, 2008, section 6.5 (there LᵀL of the
+//! mass matrix); block form for `s > 1`: ours.
+
+use alloc::vec;
+use alloc::vec::Vec;
+
+use crate::del_hessian::DelHessian;
+use crate::del_residual::DelWorkspace;
+use crate::dense_lu::DenseLu;
+use crate::errors::FactorError;
+use crate::lanes::{Instructions, Kernel, LANES, Lane, Quad, Simd};
+use crate::lobatto::MAX_UNKNOWN_NODES;
+use crate::newton_direction::{BaseEntry, NewtonDirection, jacobian_column_rule};
+use crate::row_matrix::RowMatrix;
+use crate::small_inverse::invert;
+use crate::tree::KinematicTree;
+
+/// Factorisation workspace. Build it once per tree and rule.
+#[derive(Clone, Debug)]
+pub struct BranchLu {
+    instructions: Instructions,
+    s: usize,
+    hessian: DelHessian,
+    row_starts: Vec<usize>,
+    row_quads: Vec<usize>,
+    column_starts: Vec<usize>,
+    column_quads: Vec<usize>,
+    /// Row panels: `s` rows per coordinate.
+    rows: Vec<Quad>,
+    /// Transposed column panels: `s` rows per coordinate.
+    columns: Vec<Quad>,
+    /// `D_i`, row-major.
+    pivots: Vec<f64>,
+    base: DenseLu,
+    base_rhs: Vec<f64>,
+}
+
+impl BranchLu {
+    /// For the steps of `del`.
+    pub fn new(tree: &KinematicTree, del: &DelWorkspace) -> Self {
+        let s = del.unknown_nodes();
+        let (mut row_starts, mut row_quads) = (vec![0], Vec::new());
+        let (mut column_starts, mut column_quads) = (vec![0], Vec::new());
+        for dof in 0..tree.dof() {
+            let (row, column) = if dof < tree.base_dof() {
+                (6, 0)
+            } else {
+                let depth = tree.branch(body_of(tree, dof)).len();
+                (depth, depth - 1)
+            };
+            row_quads.push((row * s).div_ceil(LANES));
+            column_quads.push((column * s).div_ceil(LANES));
+            row_starts.push(row_starts[dof] + s * row_quads[dof]);
+            column_starts.push(column_starts[dof] + s * column_quads[dof]);
+        }
+        Self {
+            instructions: del.instructions,
+            s,
+            hessian: DelHessian::new(tree, del),
+            rows: vec![Quad::ZERO; row_starts[tree.dof()]],
+            columns: vec![Quad::ZERO; column_starts[tree.dof()]],
+            row_starts,
+            row_quads,
+            column_starts,
+            column_quads,
+            pivots: vec![0.0; tree.dof() * s * s],
+            base: DenseLu::new(tree.base_dof() * s),
+            base_rhs: vec![0.0; tree.base_dof() * s],
+        }
+    }
+
+    /// The inverse pivot block `D_i` of a joint coordinate (s x s, row-major).
+    pub fn inverse_pivot(&self, dof: usize) -> &[f64] {
+        &self.pivots[dof * self.s * self.s..(dof + 1) * self.s * self.s]
+    }
+
+    /// Copies the Hessian blocks into the panels.
+    fn load(&mut self, tree: &KinematicTree, del: &DelWorkspace) {
+        match self.s {
+            1 => self.load_panels(tree, 1),
+            2 => self.load_panels(tree, 2),
+            3 => self.load_panels(tree, 3),
+            s => self.load_panels(tree, s),
+        }
+        if tree.is_floating() {
+            let s = self.s;
+            let (rows, columns) = (&mut self.rows, &mut self.columns);
+            let (row_starts, row_quads) = (&self.row_starts, &self.row_quads);
+            let (column_starts, column_quads) = (&self.column_starts, &self.column_quads);
+            jacobian_column_rule(tree, del, &self.hessian, |row, column, entry| {
+                let (row_dof, column_dof) = (row / s, column / s);
+                // Joint column of a base row: in the column panel; everything else: in the row panel.
+                let target = if column_dof >= 6 {
+                    let quad =
+                        column_starts[column_dof] + (column % s) * column_quads[column_dof] + row / LANES;
+                    &mut columns[quad].0[row % LANES]
+                } else {
+                    let quad = row_starts[row_dof] + (row % s) * row_quads[row_dof] + column / LANES;
+                    &mut rows[quad].0[column % LANES]
+                };
+                match entry {
+                    BaseEntry::Set(value) => *target = value,
+                    BaseEntry::Add(value) => *target += value,
+                }
+            });
+        }
+    }
+
+    #[inline(always)]
+    fn load_panels(&mut self, tree: &KinematicTree, s: usize) {
+        for i in tree.first_joint_body()..tree.body_count() {
+            let dof = tree.joint_dof(i);
+            let depth = tree.branch(i).len();
+            let pair = self.hessian.pair_starts[i];
+            for alpha in 0..s {
+                let start = self.row_starts[dof] + alpha * self.row_quads[dof];
+                let row = &mut self.rows[start..start + self.row_quads[dof]];
+                for position in 0..depth {
+                    for gamma in 0..s {
+                        let at = position * s + gamma;
+                        row[at / LANES].0[at % LANES] = self.hessian.entry(pair + position, alpha, gamma + 1);
+                    }
+                }
+            }
+            for gamma in 0..s {
+                let start = self.column_starts[dof] + gamma * self.column_quads[dof];
+                let column = &mut self.columns[start..start + self.column_quads[dof]];
+                for position in 0..depth - 1 {
+                    for alpha in 0..s {
+                        let at = position * s + alpha;
+                        column[at / LANES].0[at % LANES] =
+                            self.hessian.mirrored(pair + position, alpha, gamma + 1);
+                    }
+                }
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn row(&self, dof: usize, alpha: usize, at: usize) -> f64 {
+        self.rows[self.row_starts[dof] + alpha * self.row_quads[dof] + at / LANES].0[at % LANES]
+    }
+
+    #[inline(always)]
+    fn column(&self, dof: usize, gamma: usize, at: usize) -> f64 {
+        self.columns[self.column_starts[dof] + gamma * self.column_quads[dof] + at / LANES].0[at % LANES]
+    }
+
+    fn factor_base(&mut self) -> Result<(), FactorError> {
+        let (s, order) = (self.s, 6 * self.s);
+        for k in 0..6 {
+            for alpha in 0..s {
+                for at in 0..order {
+                    let value = self.row(k, alpha, at);
+                    self.base.entries_mut()[(k * s + alpha) * order + at] = value;
+                }
+            }
+        }
+        self.base.factor().map_err(|(_, pivot)| FactorError::SingularPivot { body: 0, pivot })
+    }
+}
+
+#[inline(always)]
+fn body_of(tree: &KinematicTree, dof: usize) -> usize {
+    dof - tree.base_dof() + tree.first_joint_body()
+}
+
+impl NewtonDirection for BranchLu {
+    fn factor(&mut self, tree: &KinematicTree, del: &DelWorkspace) -> Result<(), FactorError> {
+        self.hessian.evaluate(tree, del);
+        self.load(tree, del);
+        let instructions = self.instructions;
+        instructions.dispatch(Eliminate { tree, lu: self })?;
+        if tree.is_floating() { self.factor_base() } else { Ok(()) }
+    }
+
+    fn solve(&mut self, tree: &KinematicTree, rhs: &mut [f64]) {
+        let s = self.s;
+        let mut pivoted = [0.0; MAX_UNKNOWN_NODES];
+        for dof in (tree.base_dof()..tree.dof()).rev() {
+            let branch = tree.branch(body_of(tree, dof));
+            let inverse = self.inverse_pivot(dof);
+            for alpha in 0..s {
+                pivoted[alpha] = (0..s).map(|k| inverse[alpha * s + k] * rhs[dof * s + k]).sum();
+            }
+            rhs[dof * s..(dof + 1) * s].copy_from_slice(&pivoted[..s]);
+            for (position, &a) in branch[..branch.len() - 1].iter().enumerate() {
+                for alpha in 0..s {
+                    let sum: f64 =
+                        (0..s).map(|k| self.column(dof, k, position * s + alpha) * pivoted[k]).sum();
+                    rhs[a as usize * s + alpha] -= sum;
+                }
+            }
+        }
+        if tree.is_floating() {
+            self.base.solve(&mut rhs[..6 * s]);
+        }
+        for dof in tree.base_dof()..tree.dof() {
+            let branch = tree.branch(body_of(tree, dof));
+            for alpha in 0..s {
+                let mut sum = 0.0;
+                for (position, &b) in branch[..branch.len() - 1].iter().enumerate() {
+                    for k in 0..s {
+                        sum += self.row(dof, alpha, position * s + k) * rhs[b as usize * s + k];
+                    }
+                }
+                rhs[dof * s + alpha] -= sum;
+            }
+        }
+    }
+
+    fn solve_transposed(&mut self, tree: &KinematicTree, rhs: &mut [f64]) {
+        let s = self.s;
+        for dof in (tree.base_dof()..tree.dof()).rev() {
+            let branch = tree.branch(body_of(tree, dof));
+            for (position, &b) in branch[..branch.len() - 1].iter().enumerate() {
+                for k in 0..s {
+                    let sum: f64 = (0..s)
+                        .map(|alpha| self.row(dof, alpha, position * s + k) * rhs[dof * s + alpha])
+                        .sum();
+                    rhs[b as usize * s + k] -= sum;
+                }
+            }
+        }
+        if tree.is_floating() {
+            self.base.solve_transposed(&mut rhs[..6 * s]);
+        }
+        let mut reduced = [0.0; MAX_UNKNOWN_NODES];
+        for dof in tree.base_dof()..tree.dof() {
+            let branch = tree.branch(body_of(tree, dof));
+            for k in 0..s {
+                let mut sum = 0.0;
+                for (position, &a) in branch[..branch.len() - 1].iter().enumerate() {
+                    for alpha in 0..s {
+                        sum += self.column(dof, k, position * s + alpha) * rhs[a as usize * s + alpha];
+                    }
+                }
+                reduced[k] = rhs[dof * s + k] - sum;
+            }
+            let inverse = self.inverse_pivot(dof);
+            for k in 0..s {
+                rhs[dof * s + k] = (0..s).map(|alpha| inverse[alpha * s + k] * reduced[alpha]).sum();
+            }
+        }
+    }
+
+    fn solve_many(&mut self, tree: &KinematicTree, rhs: &mut RowMatrix) {
+        let instructions = self.instructions;
+        instructions.dispatch(ForwardMany { tree, lu: self, rhs });
+        if tree.is_floating() {
+            for c in 0..rhs.columns() {
+                for (r, x) in self.base_rhs.iter_mut().enumerate() {
+                    *x = rhs.get(r, c);
+                }
+                self.base.solve(&mut self.base_rhs);
+                for (r, x) in self.base_rhs.iter().enumerate() {
+                    rhs.set(r, c, *x);
+                }
+            }
+        }
+        instructions.dispatch(BackwardMany { tree, lu: self, rhs });
+    }
+
+    fn hessian(&self) -> Option<&DelHessian> {
+        Some(&self.hessian)
+    }
+}
+
+struct Eliminate<'a> {
+    tree: &'a KinematicTree,
+    lu: &'a mut BranchLu,
+}
+
+impl Kernel for Eliminate<'_> {
+    type Output = Result<(), FactorError>;
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) -> Self::Output {
+        match self.lu.s {
+            1 => eliminate::<S, 1>(simd, self.tree, self.lu, 1),
+            2 => eliminate::<S, 2>(simd, self.tree, self.lu, 2),
+            3 => eliminate::<S, 3>(simd, self.tree, self.lu, 3),
+            4 => eliminate::<S, 4>(simd, self.tree, self.lu, 4),
+            s => eliminate::<S, MAX_UNKNOWN_NODES>(simd, self.tree, self.lu, s),
+        }
+    }
+}
+
+#[inline(always)]
+fn eliminate<S: Simd, const N: usize>(
+    simd: S,
+    tree: &KinematicTree,
+    lu: &mut BranchLu,
+    s: usize,
+) -> Result<(), FactorError> {
+    let zero = Lane::splat(simd, 0.0);
+    for dof in (tree.base_dof()..tree.dof()).rev() {
+        let body = body_of(tree, dof);
+        let branch = tree.branch(body);
+        let ancestors = &branch[..branch.len() - 1];
+        let own_quads = lu.row_quads[dof];
+        let diagonal = ancestors.len() * s;
+        let mut block = [[0.0; N]; N];
+        for (alpha, row) in block.iter_mut().enumerate().take(s) {
+            for (k, entry) in row.iter_mut().enumerate().take(s) {
+                *entry = lu.row(dof, alpha, diagonal + k);
+            }
+        }
+        let inverse = invert(block, s).map_err(|pivot| FactorError::SingularPivot { body, pivot })?;
+        for alpha in 0..s {
+            let at = dof * s * s + alpha * s;
+            lu.pivots[at..at + s].copy_from_slice(&inverse[alpha][..s]);
+        }
+        let (earlier, own) = lu.rows.split_at_mut(lu.row_starts[dof]);
+        let own = &mut own[..s * own_quads];
+        let column_quads = lu.column_quads[dof];
+        for q in 0..column_quads {
+            let mut x = [zero; N];
+            for k in 0..s {
+                x[k] = Lane::load(simd, &own[k * own_quads + q]);
+            }
+            for alpha in 0..s {
+                let mut sum = Lane::splat(simd, inverse[alpha][0]) * x[0];
+                for k in 1..s {
+                    sum = Lane::splat(simd, inverse[alpha][k]).mul_add(x[k], sum);
+                }
+                own[alpha * own_quads + q] = sum.quad();
+            }
+        }
+        let (earlier_columns, own_columns) = lu.columns.split_at_mut(lu.column_starts[dof]);
+        let own_columns = &own_columns[..s * column_quads];
+        for (position, &a) in ancestors.iter().enumerate() {
+            let a = a as usize;
+            let quads = lu.row_quads[a];
+            let rows = &mut earlier[lu.row_starts[a]..lu.row_starts[a] + s * quads];
+            let mut factors = [[zero; N]; N];
+            for alpha in 0..s {
+                for k in 0..s {
+                    let at = position * s + alpha;
+                    let value = own_columns[k * column_quads + at / LANES].0[at % LANES];
+                    factors[alpha][k] = Lane::splat(simd, value);
+                }
+            }
+            subtract_rank(simd, rows, quads, own, own_quads, &factors, s);
+            let quads = lu.column_quads[a];
+            if quads == 0 {
+                continue;
+            }
+            let columns = &mut earlier_columns[lu.column_starts[a]..lu.column_starts[a] + s * quads];
+            for gamma in 0..s {
+                for k in 0..s {
+                    let at = position * s + gamma;
+                    factors[gamma][k] = Lane::splat(simd, own[k * own_quads + at / LANES].0[at % LANES]);
+                }
+            }
+            subtract_rank(simd, columns, quads, own_columns, column_quads, &factors, s);
+        }
+    }
+    Ok(())
+}
+
+/// `target_α -= Σ_k factors[α][k] source_k` over the first `quads` quads of every row.
+#[inline(always)]
+fn subtract_rank<S: Simd, const N: usize>(
+    simd: S,
+    target: &mut [Quad],
+    quads: usize,
+    source: &[Quad],
+    source_stride: usize,
+    factors: &[[Lane<S>; N]; N],
+    s: usize,
+) {
+    let zero = Lane::splat(simd, 0.0);
+    for q in 0..quads {
+        let mut x = [zero; N];
+        for k in 0..s {
+            x[k] = Lane::load(simd, &source[k * source_stride + q]);
+        }
+        for alpha in 0..s {
+            let cell = &mut target[alpha * quads + q];
+            let mut sum = Lane::load(simd, cell);
+            for k in 0..s {
+                sum = factors[alpha][k].neg_mul_add(x[k], sum);
+            }
+            *cell = sum.quad();
+        }
+    }
+}
+
+/// Quads of right-hand sides that one sweep over the tree carries in registers.
+const CHUNK: usize = 2;
+
+struct ForwardMany<'a> {
+    tree: &'a KinematicTree,
+    lu: &'a BranchLu,
+    rhs: &'a mut RowMatrix,
+}
+
+impl Kernel for ForwardMany<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        match self.lu.s {
+            1 => sweep_forward::<S, 1>(simd, self, 1),
+            2 => sweep_forward::<S, 2>(simd, self, 2),
+            3 => sweep_forward::<S, 3>(simd, self, 3),
+            s => sweep_forward::<S, MAX_UNKNOWN_NODES>(simd, self, s),
+        }
+    }
+}
+
+#[inline(always)]
+fn sweep_forward<S: Simd, const N: usize>(simd: S, work: ForwardMany<'_>, s: usize) {
+    let stride = work.rhs.stride();
+    let mut start = 0;
+    while start < stride {
+        if start + CHUNK <= stride {
+            forward_chunk::<S, N, CHUNK>(simd, work.tree, work.lu, work.rhs.quads_mut(), stride, start, s);
+        } else {
+            for q in start..stride {
+                forward_chunk::<S, N, 1>(simd, work.tree, work.lu, work.rhs.quads_mut(), stride, q, s);
+            }
+        }
+        start += CHUNK;
+    }
+}
+
+#[inline(always)]
+fn forward_chunk<S: Simd, const N: usize, const W: usize>(
+    simd: S,
+    tree: &KinematicTree,
+    lu: &BranchLu,
+    data: &mut [Quad],
+    stride: usize,
+    at: usize,
+    s: usize,
+) {
+    let zero = Lane::splat(simd, 0.0);
+    for dof in (tree.base_dof()..tree.dof()).rev() {
+        let mut x = [[zero; W]; N];
+        for k in 0..s {
+            for w in 0..W {
+                x[k][w] = Lane::load(simd, &data[(dof * s + k) * stride + at + w]);
+            }
+        }
+        let inverse = &lu.pivots[dof * s * s..(dof + 1) * s * s];
+        let mut y = [[zero; W]; N];
+        for alpha in 0..s {
+            for k in 0..s {
+                let factor = Lane::splat(simd, inverse[alpha * s + k]);
+                for w in 0..W {
+                    y[alpha][w] = factor.mul_add(x[k][w], y[alpha][w]);
+                }
+            }
+            for w in 0..W {
+                data[(dof * s + alpha) * stride + at + w] = y[alpha][w].quad();
+            }
+        }
+        let branch = tree.branch(body_of(tree, dof));
+        let quads = lu.column_quads[dof];
+        let columns = &lu.columns[lu.column_starts[dof]..lu.column_starts[dof] + s * quads];
+        for (position, &a) in branch[..branch.len() - 1].iter().enumerate() {
+            for alpha in 0..s {
+                let entry = position * s + alpha;
+                let row = &mut data[(a as usize * s + alpha) * stride + at..][..W];
+                let mut sum: [Lane<S>; W] = core::array::from_fn(|w| Lane::load(simd, &row[w]));
+                for k in 0..s {
+                    let factor = Lane::splat(simd, columns[k * quads + entry / LANES].0[entry % LANES]);
+                    for w in 0..W {
+                        sum[w] = factor.neg_mul_add(y[k][w], sum[w]);
+                    }
+                }
+                for w in 0..W {
+                    row[w] = sum[w].quad();
+                }
+            }
+        }
+    }
+}
+
+struct BackwardMany<'a> {
+    tree: &'a KinematicTree,
+    lu: &'a BranchLu,
+    rhs: &'a mut RowMatrix,
+}
+
+impl Kernel for BackwardMany<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        match self.lu.s {
+            1 => sweep_backward::<S, 1>(simd, self, 1),
+            2 => sweep_backward::<S, 2>(simd, self, 2),
+            3 => sweep_backward::<S, 3>(simd, self, 3),
+            s => sweep_backward::<S, MAX_UNKNOWN_NODES>(simd, self, s),
+        }
+    }
+}
+
+#[inline(always)]
+fn sweep_backward<S: Simd, const N: usize>(simd: S, work: BackwardMany<'_>, s: usize) {
+    let stride = work.rhs.stride();
+    let mut start = 0;
+    while start < stride {
+        if start + CHUNK <= stride {
+            backward_chunk::<S, N, CHUNK>(simd, work.tree, work.lu, work.rhs.quads_mut(), stride, start, s);
+        } else {
+            for q in start..stride {
+                backward_chunk::<S, N, 1>(simd, work.tree, work.lu, work.rhs.quads_mut(), stride, q, s);
+            }
+        }
+        start += CHUNK;
+    }
+}
+
+#[inline(always)]
+fn backward_chunk<S: Simd, const N: usize, const W: usize>(
+    simd: S,
+    tree: &KinematicTree,
+    lu: &BranchLu,
+    data: &mut [Quad],
+    stride: usize,
+    at: usize,
+    s: usize,
+) {
+    let zero = Lane::splat(simd, 0.0);
+    for dof in tree.base_dof()..tree.dof() {
+        let branch = tree.branch(body_of(tree, dof));
+        let quads = lu.row_quads[dof];
+        let rows = &lu.rows[lu.row_starts[dof]..lu.row_starts[dof] + s * quads];
+        let mut sum = [[zero; W]; N];
+        for alpha in 0..s {
+            for w in 0..W {
+                sum[alpha][w] = Lane::load(simd, &data[(dof * s + alpha) * stride + at + w]);
+            }
+        }
+        for (position, &b) in branch[..branch.len() - 1].iter().enumerate() {
+            for k in 0..s {
+                let entry = position * s + k;
+                let row = &data[(b as usize * s + k) * stride + at..][..W];
+                let y: [Lane<S>; W] = core::array::from_fn(|w| Lane::load(simd, &row[w]));
+                for alpha in 0..s {
+                    let factor = Lane::splat(simd, rows[alpha * quads + entry / LANES].0[entry % LANES]);
+                    for w in 0..W {
+                        sum[alpha][w] = factor.neg_mul_add(y[w], sum[alpha][w]);
+                    }
+                }
+            }
+        }
+        for alpha in 0..s {
+            for w in 0..W {
+                data[(dof * s + alpha) * stride + at + w] = sum[alpha][w].quad();
+            }
+        }
+    }
+}

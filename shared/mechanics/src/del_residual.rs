@@ -1,0 +1,877 @@
+//! Algorithm 1: evaluation of the discrete Euler-Lagrange (DEL) equations in O(s n).
+//!
+//! | letter | field | meaning (all in frame {0}, 6-vectors angular first) |
+//! |---|---|---|
+//! | `q^α`, `q̇^α` | `q`, `q_dot` | control nodes and their rates, `q̇^α = (1/Δt) Σ_β b^{αβ} q^β` |
+//! | `g_i = (R, p)` | `rotation`, `position` | body frame: link axes, origin at the mass centre |
+//! | `S_i`, `Ṡ_i` | `joint_twist`, `joint_twist_rate` | joint twist and its rate `ad_{v_i} S_i` |
+//! | `v_i` | `velocity` | spatial velocity |
+//! | `μ_i` | `momentum` | articulated momentum: of the body and all it carries |
+//! | `Γ_i` | `impulse` | articulated impulse `w_α Δt F`, summed over the body and all it carries |
+//!
+//! ```text
+//! outward  g_i = g_par g_{par,i}(q_i)     v_i = v_par + S_i q̇_i     Ṡ_i = ad_{v_i} S_i
+//! inward   μ_i = M_i v_i + Σ_chd μ_j      Γ_i = w_α Δt F_i + Σ_chd Γ_j
+//! rows     r_i^α = w_α Δt Ṡᵀμ + SᵀΓ + Σ_β a^{αβ} S^βᵀμ^β + w_α Δt Q_i        (+ p_i at α = 0; row s is p_i of the next state)
+//! ```
+//!
+//! Cost: about 400 (s + 1) flops per body; no allocation after construction. Nodes are lanes ([`crate::lanes`]).
+//! Source: the paper, Algorithm 1 (line 20 of the print has a stray `end for`); rows of the floating base:
+//! [`crate::floating_base`].
+
+use alloc::vec;
+use alloc::vec::Vec;
+use nalgebra::{Matrix3, Matrix6, Vector3};
+
+use crate::errors::{ModelError, StepError};
+use crate::floating_base::{BaseLanes, base_kinematics, base_project, base_project_rate};
+use crate::forces::{BodySample, JointForces, StepForces};
+use crate::lanes::{
+    Instructions, Kernel, LANES, Lane, Lane3, Lane6, Lane9, Quad, Simd, add, cross, cross_add, dot6, halves,
+    join, load, mat_mul, mat_tr_vec, mat_vec, mat_vec_add, scale, splat, store, sub, sym_vec,
+};
+use crate::lobatto::LobattoRule;
+use crate::real::sin_cos;
+use crate::spatial::{RigidTransform, Twist, Wrench, exp_rotation};
+use crate::state::State;
+use crate::tree::{BodyConstants, KinematicTree, NO_PARENT};
+
+/// One body at the nodes of one lane group.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct BodyLanes {
+    pub rotation: [Quad; 9],
+    pub position: [Quad; 3],
+    pub joint_twist: [Quad; 6],
+    pub joint_twist_rate: [Quad; 6],
+    pub velocity: [Quad; 6],
+    pub momentum: [Quad; 6],
+    pub impulse: [Quad; 6],
+}
+
+/// A wrench whose direction in {0} does not follow the body: `f` at the end of an arm that is fixed in the body.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct DeadLoad {
+    pub body: usize,
+    /// From the mass centre, link axes.
+    pub arm_b: [f64; 3],
+    /// A couple `arm × f` without resultant force, instead of a force at the point.
+    pub couple: bool,
+}
+
+/// Wrench of the laws on one body and its gains, at the nodes of one lane group.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct GainLanes {
+    /// Wrench that follows the body or depends on its motion: laws, drag, constant body wrench.
+    pub wrench: [Quad; 6],
+    /// `F_η`, row-major.
+    pub eta: [Quad; 36],
+    /// `F_ν`, row-major.
+    pub nu: [Quad; 36],
+}
+
+impl GainLanes {
+    const ZERO: Self = Self { wrench: [Quad::ZERO; 6], eta: [Quad::ZERO; 36], nu: [Quad::ZERO; 36] };
+}
+
+/// Room for forces outside the model, fixed when a workspace is made.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ForceCapacity {
+    /// Largest number of point forces in a step.
+    pub points: usize,
+    /// Whether [`crate::forces::WrenchLaw`]s may be given.
+    pub laws: bool,
+}
+
+/// Workspace of Algorithm 1: everything the step knows about its nodes.
+#[derive(Clone, Debug)]
+pub struct DelWorkspace {
+    pub(crate) instructions: Instructions,
+    pub(crate) rule: LobattoRule,
+    pub(crate) time_step: f64,
+    /// Lane groups: nodes 0..3, 4..7, ...
+    pub(crate) groups: usize,
+    /// `w_α Δt` per lane group; zero in unused lanes.
+    pub(crate) weights: Vec<Quad>,
+    /// `b^{αβ}/Δt`, lanes over α: `[β * groups + g]`.
+    pub(crate) derivative: Vec<Quad>,
+    /// `a^{αβ}`, lanes over α: `[β * groups + g]`.
+    pub(crate) weighted_derivative: Vec<Quad>,
+    /// Coordinates at the nodes: `[dof * groups + g]`; a floating base holds its chart `ξ` here.
+    pub(crate) q: Vec<Quad>,
+    pub(crate) q_dot: Vec<Quad>,
+    pub(crate) joint_forces: Vec<Quad>,
+    /// `[body * groups + g]`.
+    pub(crate) bodies: Vec<BodyLanes>,
+    /// `[g]`, floating base only.
+    pub(crate) base: Vec<BaseLanes>,
+    /// Raw rows, lanes over α: `[dof * groups + g]`. Base rows lack the Γ term at node s.
+    pub(crate) rows: Vec<Quad>,
+    pub(crate) loads: Vec<DeadLoad>,
+    /// Forces of the loads: `[load * groups + g]`.
+    pub(crate) load_forces: Vec<[Quad; 3]>,
+    /// `[body * groups + g]`, empty for models without body wrenches and laws.
+    pub(crate) gains: Vec<GainLanes>,
+    pub(crate) start: State,
+    pub(crate) capacity: ForceCapacity,
+    pub(crate) center: RigidTransform,
+    load_capacity: usize,
+    projections: Vec<[Quad; 6]>,
+}
+
+impl DelWorkspace {
+    /// A workspace for steps of `time_step` (s) of `tree` by `rule`.
+    ///
+    /// # Errors
+    /// [`ModelError::TimeStep`] unless the step is positive and finite.
+    pub fn new(
+        tree: &KinematicTree,
+        rule: &LobattoRule,
+        time_step: f64,
+        capacity: ForceCapacity,
+    ) -> Result<Self, ModelError> {
+        Self::with_loads(tree, rule, time_step, capacity, capacity.points)
+    }
+
+    pub(crate) fn with_loads(
+        tree: &KinematicTree,
+        rule: &LobattoRule,
+        time_step: f64,
+        capacity: ForceCapacity,
+        load_capacity: usize,
+    ) -> Result<Self, ModelError> {
+        let groups = (rule.unknown_nodes() + LANES) / LANES;
+        let nodes = rule.nodes().len();
+        let (dof, bodies) = (tree.dof() * groups, tree.body_count() * groups);
+        let gains = if tree.has_body_wrenches() || capacity.laws { bodies } else { 0 };
+        let mut workspace = Self {
+            instructions: Instructions::detect(),
+            rule: rule.clone(),
+            time_step: 0.0,
+            groups,
+            weights: vec![Quad::ZERO; groups],
+            derivative: vec![Quad::ZERO; nodes * groups],
+            weighted_derivative: vec![Quad::ZERO; nodes * groups],
+            q: vec![Quad::ZERO; dof],
+            q_dot: vec![Quad::ZERO; dof],
+            joint_forces: vec![Quad::ZERO; tree.joint_count() * groups],
+            bodies: vec![BodyLanes::default(); bodies],
+            base: vec![BaseLanes::default(); if tree.is_floating() { groups } else { 0 }],
+            rows: vec![Quad::ZERO; dof],
+            loads: Vec::with_capacity(load_capacity),
+            load_forces: Vec::with_capacity(load_capacity * groups),
+            gains: vec![GainLanes::ZERO; gains],
+            start: State::zeros(tree),
+            center: RigidTransform::identity(),
+            capacity,
+            load_capacity,
+            projections: vec![[Quad::ZERO; 6]; groups],
+        };
+        for alpha in 0..nodes {
+            for beta in 0..nodes {
+                let at = beta * groups + alpha / LANES;
+                workspace.weighted_derivative[at].0[alpha % LANES] = rule.weighted_derivative(alpha, beta);
+            }
+        }
+        workspace.set_time_step(time_step)?;
+        Ok(workspace)
+    }
+
+    /// Changes the time step (s).
+    ///
+    /// # Errors
+    /// [`ModelError::TimeStep`] unless positive and finite.
+    pub fn set_time_step(&mut self, time_step: f64) -> Result<(), ModelError> {
+        if !(time_step.is_finite() && time_step > 0.0) {
+            return Err(ModelError::TimeStep { time_step });
+        }
+        self.time_step = time_step;
+        let nodes = self.rule.nodes().len();
+        for alpha in 0..nodes {
+            let (g, lane) = (alpha / LANES, alpha % LANES);
+            self.weights[g].0[lane] = self.rule.weights()[alpha] * time_step;
+            for beta in 0..nodes {
+                self.derivative[beta * self.groups + g].0[lane] =
+                    self.rule.derivative(alpha, beta) / time_step;
+            }
+        }
+        Ok(())
+    }
+
+    /// Time step, s.
+    pub fn time_step(&self) -> f64 {
+        self.time_step
+    }
+
+    /// The quadrature rule.
+    pub fn rule(&self) -> &LobattoRule {
+        &self.rule
+    }
+
+    /// Unknown nodes `s`.
+    pub fn unknown_nodes(&self) -> usize {
+        self.rule.unknown_nodes()
+    }
+
+    /// Sets where the step starts and what acts during it. All nodes are put at the start (a floating base at its pose).
+    ///
+    /// # Errors
+    /// [`ModelError::Length`] for slices of the wrong length or too many point forces; [`StepError::NonFinite`] naming the
+    /// first NaN or infinite input.
+    pub fn begin(
+        &mut self,
+        tree: &KinematicTree,
+        state: &State,
+        forces: &StepForces<'_>,
+    ) -> Result<(), StepError> {
+        self.check_inputs(tree, state, forces)?;
+        self.start.copy_from(state);
+        let groups = self.groups;
+        let base = tree.base_dof();
+        for (dof, &q) in state.q.iter().enumerate() {
+            self.q[(base + dof) * groups..(base + dof + 1) * groups].fill(Quad::splat(q));
+        }
+        self.q[..base * groups].fill(Quad::ZERO);
+        self.set_joint_forces(tree, &forces.joints);
+        self.loads.clear();
+        self.load_forces.clear();
+        for point in forces.points {
+            self.loads.push(DeadLoad { body: point.body, arm_b: point.point_b.into(), couple: false });
+            for _ in 0..groups {
+                self.load_forces.push([0, 1, 2].map(|k| Quad::splat(point.force_w[k])));
+            }
+        }
+        Ok(())
+    }
+
+    fn check_inputs(
+        &self,
+        tree: &KinematicTree,
+        state: &State,
+        forces: &StepForces<'_>,
+    ) -> Result<(), StepError> {
+        let length = |quantity, got: usize, expected: usize| {
+            if got == expected { Ok(()) } else { Err(ModelError::Length { quantity, got, expected }) }
+        };
+        let finite = |quantity, values: &[f64]| match values.iter().position(|x| !x.is_finite()) {
+            None => Ok(()),
+            Some(index) => Err(StepError::NonFinite { quantity, index }),
+        };
+        let joints = tree.joint_count();
+        length("tree (coordinates of the workspace)", tree.dof() * self.groups, self.q.len())?;
+        length("joint coordinates q", state.q.len(), joints)?;
+        length("momenta p", state.p.len(), tree.dof())?;
+        finite("q", &state.q)?;
+        finite("p", &state.p)?;
+        finite("base rotation", state.base_pose.rotation.as_slice())?;
+        finite("base position", state.base_pose.translation.as_slice())?;
+        match forces.joints {
+            JointForces::Held(u) => {
+                length("held joint forces", u.len(), joints)?;
+                finite("joint force", u)?;
+            }
+            JointForces::PerNode(u) => {
+                length("joint forces per node", u.len(), joints * self.rule.nodes().len())?;
+                finite("joint force", u)?;
+            }
+        }
+        if forces.points.len() > self.capacity.points {
+            return Err(ModelError::Length {
+                quantity: "point forces (capacity of the workspace)",
+                got: forces.points.len(),
+                expected: self.capacity.points,
+            }
+            .into());
+        }
+        for point in forces.points {
+            if point.body >= tree.body_count() {
+                return Err(ModelError::Unsupported {
+                    body: point.body,
+                    reason: "a point force names no body",
+                }
+                .into());
+            }
+            finite("point force", point.force_w.as_slice())?;
+            finite("point of a point force", point.point_b.as_slice())?;
+        }
+        if !forces.laws.is_empty() && !self.capacity.laws {
+            return Err(ModelError::Unsupported {
+                body: forces.laws[0].body(),
+                reason: "the workspace was made without room for wrench laws",
+            }
+            .into());
+        }
+        match forces.laws.iter().find(|law| law.body() >= tree.body_count()) {
+            Some(law) => {
+                Err(ModelError::Unsupported { body: law.body(), reason: "a wrench law names no body" }.into())
+            }
+            None => Ok(()),
+        }
+    }
+
+    fn set_joint_forces(&mut self, tree: &KinematicTree, forces: &JointForces<'_>) {
+        let (groups, joints) = (self.groups, tree.joint_count());
+        match forces {
+            JointForces::Held(u) => {
+                for (joint, &u) in u.iter().enumerate() {
+                    self.joint_forces[joint * groups..(joint + 1) * groups].fill(Quad::splat(u));
+                }
+            }
+            JointForces::PerNode(u) => {
+                for (alpha, at_node) in u.chunks_exact(joints).enumerate() {
+                    for (joint, &u) in at_node.iter().enumerate() {
+                        self.joint_forces[joint * groups + alpha / LANES].0[alpha % LANES] = u;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Adds a load whose force differs from node to node (constraint forces); returns its index.
+    pub(crate) fn push_load(&mut self, load: DeadLoad) -> usize {
+        debug_assert!(self.loads.len() < self.load_capacity, "more loads than the workspace was made for");
+        self.loads.push(load);
+        for _ in 0..self.groups {
+            self.load_forces.push([Quad::ZERO; 3]);
+        }
+        self.loads.len() - 1
+    }
+
+    /// Coordinate `dof` at node `alpha`: joint coordinate, or chart coordinate of a floating base.
+    #[inline]
+    pub fn node(&self, alpha: usize, dof: usize) -> f64 {
+        self.q[dof * self.groups + alpha / LANES].0[alpha % LANES]
+    }
+
+    /// Rate of coordinate `dof` at node `alpha`.
+    #[inline]
+    pub fn node_rate(&self, alpha: usize, dof: usize) -> f64 {
+        self.q_dot[dof * self.groups + alpha / LANES].0[alpha % LANES]
+    }
+
+    /// Sets coordinate `dof` at node `alpha` (1..=s). Node 0 of a floating base's chart follows node s by itself.
+    #[inline]
+    pub fn set_node(&mut self, alpha: usize, dof: usize, value: f64) {
+        self.q[dof * self.groups + alpha / LANES].0[alpha % LANES] = value;
+    }
+
+    /// Pose of the body frame (link axes, origin at the mass centre) at node `alpha`, in {0}; valid after [`evaluate`].
+    ///
+    /// [`evaluate`]: DelWorkspace::evaluate
+    pub fn body_pose(&self, body: usize, alpha: usize) -> RigidTransform {
+        let lanes = &self.bodies[body * self.groups + alpha / LANES];
+        let lane = alpha % LANES;
+        RigidTransform {
+            rotation: Matrix3::from_fn(|r, c| lanes.rotation[3 * r + c].0[lane]),
+            translation: Vector3::from_fn(|r, _| lanes.position[r].0[lane]),
+        }
+    }
+
+    /// Spatial velocity of a body at node `alpha`, in {0}; order `s` only, for wrench laws and logs, not for sensors.
+    pub fn body_velocity(&self, body: usize, alpha: usize) -> Twist {
+        let lanes = &self.bodies[body * self.groups + alpha / LANES];
+        let at = |k: usize| lanes.velocity[k].0[alpha % LANES];
+        Twist { angular: Vector3::new(at(0), at(1), at(2)), linear: Vector3::new(at(3), at(4), at(5)) }
+    }
+
+    /// Articulated momentum and impulse (`w_α Δt F`) of a body at node `alpha`, in {0}.
+    pub fn body_momentum_and_impulse(&self, body: usize, alpha: usize) -> (Wrench, Wrench) {
+        let lanes = &self.bodies[body * self.groups + alpha / LANES];
+        let read = |v: &[Quad; 6]| {
+            let at = |k: usize| v[k].0[alpha % LANES];
+            Wrench { torque: Vector3::new(at(0), at(1), at(2)), force: Vector3::new(at(3), at(4), at(5)) }
+        };
+        (read(&lanes.momentum), read(&lanes.impulse))
+    }
+
+    /// Algorithm 1 at the present nodes: fills every body's lanes and the rows. O(s n), no allocation.
+    pub fn evaluate(&mut self, tree: &KinematicTree, laws: &[&dyn crate::forces::WrenchLaw]) {
+        if tree.is_floating() {
+            self.center_chart();
+        }
+        let instructions = self.instructions;
+        instructions.dispatch(Outward { tree, workspace: self });
+        if !self.gains.is_empty() {
+            self.evaluate_laws(laws);
+        }
+        instructions.dispatch(Inward { tree, workspace: self });
+    }
+
+    /// `ξ^0 := -ξ^s` and the chart centre that puts node 0 at the given pose.
+    fn center_chart(&mut self) {
+        let s = self.unknown_nodes();
+        let xi: [f64; 6] = core::array::from_fn(|k| self.node(s, k));
+        for (k, value) in xi.iter().enumerate() {
+            self.set_node(0, k, -value);
+            // Unused lanes must stay finite.
+            for unused in s + 1..self.groups * LANES {
+                self.set_node(unused, k, -value);
+            }
+        }
+        let rotation = self.start.base_pose.rotation * exp_rotation(&Vector3::new(xi[0], xi[1], xi[2]));
+        let translation = self.start.base_pose.translation + rotation * Vector3::new(xi[3], xi[4], xi[5]);
+        self.center = RigidTransform { rotation, translation };
+    }
+
+    fn evaluate_laws(&mut self, laws: &[&dyn crate::forces::WrenchLaw]) {
+        for gain in &mut self.gains {
+            *gain = GainLanes::ZERO;
+        }
+        for law in laws {
+            let body = law.body();
+            for alpha in 0..=self.unknown_nodes() {
+                let sample = BodySample {
+                    pose_w: self.body_pose(body, alpha),
+                    velocity_w: self.body_velocity(body, alpha),
+                    time: self.rule.nodes()[alpha] * self.time_step,
+                };
+                let answer = law.evaluate(&sample);
+                let gain = &mut self.gains[body * self.groups + alpha / LANES];
+                let lane = alpha % LANES;
+                let wrench = answer.wrench_w.to_vector();
+                for k in 0..6 {
+                    gain.wrench[k].0[lane] += wrench[k];
+                }
+                add_matrix(&mut gain.eta, &answer.d_pose, lane);
+                add_matrix(&mut gain.nu, &answer.d_velocity, lane);
+            }
+        }
+    }
+
+    /// The DEL residual `r^α`, `α = 0..s-1`, coordinate-major: entry `dof * s + α`. O(s n).
+    ///
+    /// # Panics
+    /// Never; `out` must hold `s` times the number of coordinates (debug-checked).
+    pub fn residual_into(&self, tree: &KinematicTree, out: &mut [f64]) {
+        let s = self.unknown_nodes();
+        debug_assert_eq!(out.len(), s * tree.dof());
+        let base = tree.base_dof();
+        for dof in 0..tree.dof() {
+            for alpha in 0..s {
+                out[dof * s + alpha] = self.rows[dof * self.groups + alpha / LANES].0[alpha % LANES];
+            }
+        }
+        for dof in base..tree.dof() {
+            out[dof * s] += self.start.p[dof];
+        }
+        if tree.is_floating() {
+            let momentum = self.start_momentum();
+            let before_end = self.base_momentum_before_end();
+            let first = self.project_base(0, &momentum);
+            let last = self.project_base(s, &before_end);
+            for k in 0..6 {
+                let row_s = self.rows[k * self.groups + s / LANES].0[s % LANES];
+                out[k * s] += first[k] + last[k] - row_s;
+            }
+        }
+    }
+
+    /// Momenta at the end of the step: row s, and `P^1` of a floating base. Meaningful once the residual is zero. O(n).
+    pub fn next_momentum_into(&self, tree: &KinematicTree, out: &mut [f64]) {
+        let s = self.unknown_nodes();
+        for (dof, p) in out.iter_mut().enumerate().take(tree.dof()) {
+            *p = self.rows[dof * self.groups + s / LANES].0[s % LANES];
+        }
+        if tree.is_floating() {
+            let (_, end_impulse) = self.body_momentum_and_impulse(0, s);
+            let total = self.base_momentum_before_end() + end_impulse;
+            out[..6].copy_from_slice(total.to_vector().as_slice());
+        }
+    }
+
+    pub(crate) fn start_momentum(&self) -> Wrench {
+        let p = &self.start.p;
+        Wrench { torque: Vector3::new(p[0], p[1], p[2]), force: Vector3::new(p[3], p[4], p[5]) }
+    }
+
+    /// `G = P^0 + Σ_{α<s} Γ^α` of a floating base.
+    pub(crate) fn base_momentum_before_end(&self) -> Wrench {
+        let mut total = self.start_momentum();
+        for alpha in 0..self.unknown_nodes() {
+            total += self.body_momentum_and_impulse(0, alpha).1;
+        }
+        total
+    }
+
+    /// `S^αᵀ X` of the floating base.
+    pub(crate) fn project_base(&self, alpha: usize, wrench: &Wrench) -> [f64; 6] {
+        let base = &self.base[alpha / LANES];
+        let lane = alpha % LANES;
+        let z = Matrix3::from_fn(|r, c| base.z[3 * r + c].0[lane]);
+        let position = Vector3::from_fn(|r, _| base.position[r].0[lane]);
+        let upper = z.tr_mul(&(wrench.torque - position.cross(&wrench.force)));
+        let lower = self.center.rotation.tr_mul(&wrench.force);
+        [upper.x, upper.y, upper.z, lower.x, lower.y, lower.z]
+    }
+
+    /// The state at the end of the step. Meaningful once the residual is zero. O(n).
+    pub fn next_state_into(&self, tree: &KinematicTree, out: &mut State) {
+        let s = self.unknown_nodes();
+        for (joint, q) in out.q.iter_mut().enumerate() {
+            *q = self.node(s, tree.base_dof() + joint);
+        }
+        if tree.is_floating() {
+            let mut pose = self.body_pose(0, s);
+            // One Newton step towards the nearest rotation; momentum is not touched by it.
+            pose.rotation =
+                pose.rotation * (Matrix3::identity() * 3.0 - pose.rotation.tr_mul(&pose.rotation)) * 0.5;
+            out.base_pose = pose;
+        }
+        self.next_momentum_into(tree, &mut out.p);
+    }
+}
+
+fn add_matrix(target: &mut [Quad; 36], matrix: &Matrix6<f64>, lane: usize) {
+    for r in 0..6 {
+        for c in 0..6 {
+            target[6 * r + c].0[lane] += matrix[(r, c)];
+        }
+    }
+}
+
+/// A1.1: rates, poses, velocities, and each body's own momentum.
+struct Outward<'a> {
+    tree: &'a KinematicTree,
+    workspace: &'a mut DelWorkspace,
+}
+
+impl Kernel for Outward<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { tree, workspace } = self;
+        let groups = workspace.groups;
+        let s = workspace.rule.unknown_nodes();
+        rates(simd, &workspace.derivative, groups, s, &workspace.q, &mut workspace.q_dot);
+        for g in 0..groups {
+            if tree.is_floating() {
+                base_outward(simd, tree, workspace, g);
+            }
+            for i in tree.first_joint_body()..tree.body_count() {
+                joint_outward(simd, tree, workspace, i, g);
+            }
+        }
+    }
+}
+
+/// `q̇^α = (1/Δt) Σ_β b^{αβ} (q^β - q^0)`: the rows of `b` sum to zero, and differences keep the digits.
+#[inline(always)]
+pub(crate) fn rates<S: Simd>(
+    simd: S,
+    derivative: &[Quad],
+    groups: usize,
+    s: usize,
+    q: &[Quad],
+    q_dot: &mut [Quad],
+) {
+    for (q, q_dot) in q.chunks_exact(groups).zip(q_dot.chunks_exact_mut(groups)) {
+        for (g, rate) in q_dot.iter_mut().enumerate() {
+            let mut sum = Lane::splat(simd, 0.0);
+            for beta in 1..=s {
+                let change = q[beta / LANES].0[beta % LANES] - q[0].0[0];
+                let column = Lane::load(simd, &derivative[beta * groups + g]);
+                sum = column.mul_add(Lane::splat(simd, change), sum);
+            }
+            *rate = sum.quad();
+        }
+    }
+}
+
+#[inline(always)]
+fn base_outward<S: Simd>(simd: S, tree: &KinematicTree, workspace: &mut DelWorkspace, g: usize) {
+    let groups = workspace.groups;
+    let xi: [Quad; 6] = core::array::from_fn(|k| workspace.q[k * groups + g]);
+    let xi_dot: [Quad; 6] = core::array::from_fn(|k| workspace.q_dot[k * groups + g]);
+    let rotation = workspace.center.rotation.transpose();
+    let mut center = [0.0; 9];
+    center.copy_from_slice(rotation.as_slice());
+    let position: [f64; 3] = workspace.center.translation.into();
+    let (r, p, v) = base_kinematics(simd, xi, xi_dot, &center, &position, &mut workspace.base[g]);
+    let body = &mut workspace.bodies[g];
+    body.rotation = store(r);
+    body.position = store(p);
+    body.velocity = store(v);
+    body.momentum = store(own_momentum(simd, &tree.constants()[0], &r, p, v));
+}
+
+#[inline(always)]
+fn joint_outward<S: Simd>(simd: S, tree: &KinematicTree, workspace: &mut DelWorkspace, i: usize, g: usize) {
+    let groups = workspace.groups;
+    let constants = &tree.constants()[i];
+    let dof = tree.joint_dof(i) * groups + g;
+    let q = workspace.q[dof];
+    let q_dot = Lane::load(simd, &workspace.q_dot[dof]);
+
+    let mut e: Lane9<S> = splat(simd, &constants.e0);
+    if constants.revolute {
+        let (mut sin, mut versine) = (Quad::ZERO, Quad::ZERO);
+        for lane in 0..LANES {
+            if g * LANES + lane > workspace.rule.unknown_nodes() {
+                break;
+            }
+            let (s, c) = sin_cos(q.0[lane]);
+            sin.0[lane] = s;
+            versine.0[lane] = 1.0 - c;
+        }
+        let (sin, versine) = (Lane::load(simd, &sin), Lane::load(simd, &versine));
+        e = core::array::from_fn(|k| {
+            let bend = versine.mul_add(Lane::splat(simd, constants.e2[k]), e[k]);
+            sin.mul_add(Lane::splat(simd, constants.e1[k]), bend)
+        });
+    }
+    let joint_origin = splat(simd, &constants.joint_origin);
+    let axis = splat(simd, &constants.axis);
+    let com = splat(simd, &constants.com);
+    let zero = Lane::splat(simd, 0.0);
+    let (rotation, origin, axis, parent_velocity) = if constants.parent == NO_PARENT {
+        (e, joint_origin, axis, [zero; 6])
+    } else {
+        let parent = &workspace.bodies[constants.parent * groups + g];
+        let parent_rotation = load(simd, &parent.rotation);
+        (
+            mat_mul(&parent_rotation, &e),
+            mat_vec_add(&parent_rotation, joint_origin, load(simd, &parent.position)),
+            mat_vec(&parent_rotation, axis),
+            load(simd, &parent.velocity),
+        )
+    };
+    let mut position = mat_vec_add(&rotation, com, origin);
+    let joint_twist = if constants.revolute {
+        join(axis, cross(origin, axis))
+    } else {
+        let travel = Lane::load(simd, &q);
+        position = crate::lanes::scale_add(travel, axis, position);
+        join([zero; 3], axis)
+    };
+    let velocity = crate::lanes::scale_add(q_dot, joint_twist, parent_velocity);
+    let momentum = own_momentum(simd, constants, &rotation, position, velocity);
+    let body = &mut workspace.bodies[i * groups + g];
+    body.rotation = store(rotation);
+    body.position = store(position);
+    body.joint_twist = store(joint_twist);
+    // ad_{v_i} S_i = ad_{v_par} S_i, because S_i commutes with itself.
+    body.joint_twist_rate = store(crate::lanes::bracket(parent_velocity, joint_twist));
+    body.velocity = store(velocity);
+    body.momentum = store(momentum);
+}
+
+/// `M_i v_i` of one body about the origin of {0}.
+#[inline(always)]
+pub(crate) fn own_momentum<S: Simd>(
+    simd: S,
+    constants: &BodyConstants,
+    rotation: &Lane9<S>,
+    position: Lane3<S>,
+    velocity: Lane6<S>,
+) -> Lane6<S> {
+    let (omega, linear) = halves(velocity);
+    let mass = Lane::splat(simd, constants.mass);
+    let force = scale(mass, sub(linear, cross(position, omega)));
+    let inertia: Lane6<S> = splat(simd, &constants.inertia);
+    let spin = mat_vec(rotation, sym_vec(&inertia, mat_tr_vec(rotation, omega)));
+    join(cross_add(position, force, spin), force)
+}
+
+/// A1.2 and A1.3: wrenches, articulated momenta and impulses, rows.
+struct Inward<'a> {
+    tree: &'a KinematicTree,
+    workspace: &'a mut DelWorkspace,
+}
+
+impl Kernel for Inward<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { tree, workspace } = self;
+        let groups = workspace.groups;
+        own_impulses(simd, tree, workspace);
+        for i in (tree.first_joint_body()..tree.body_count()).rev() {
+            let parent = tree.constants()[i].parent;
+            for g in 0..groups {
+                let body = &workspace.bodies[i * groups + g];
+                let momentum: Lane6<S> = load(simd, &body.momentum);
+                let impulse: Lane6<S> = load(simd, &body.impulse);
+                workspace.projections[g][0] = dot6(load(simd, &body.joint_twist), momentum).quad();
+                if parent != NO_PARENT {
+                    let target = &mut workspace.bodies[parent * groups + g];
+                    target.momentum = store(add(load(simd, &target.momentum), momentum));
+                    target.impulse = store(add(load(simd, &target.impulse), impulse));
+                }
+            }
+            for g in 0..groups {
+                joint_row(simd, tree, workspace, i, g);
+            }
+        }
+        if tree.is_floating() {
+            base_rows(simd, workspace);
+        }
+    }
+}
+
+/// `w_α Δt F_i` of every body.
+#[inline(always)]
+fn own_impulses<S: Simd>(simd: S, tree: &KinematicTree, workspace: &mut DelWorkspace) {
+    let groups = workspace.groups;
+    let gravity: [f64; 3] = (*tree.gravity_w()).into();
+    for (i, constants) in tree.constants().iter().enumerate() {
+        let weight: Lane3<S> = splat(simd, &gravity.map(|g| g * constants.mass));
+        for g in 0..groups {
+            let body = &mut workspace.bodies[i * groups + g];
+            let step = Lane::load(simd, &workspace.weights[g]);
+            let position: Lane3<S> = load(simd, &body.position);
+            let mut wrench = join(cross(position, weight), weight);
+            if let Some(gain) = workspace.gains.get_mut(i * groups + g) {
+                let mut general = load(simd, &gain.wrench);
+                if constants.drag.is_some() || constants.constant_wrench.is_some() {
+                    general = add(general, body_fixed_wrench(simd, constants, body));
+                }
+                gain.wrench = store(general);
+                wrench = add(wrench, general);
+                if let Some(drag) = &constants.drag {
+                    add_drag_gain(simd, drag, body, gain);
+                }
+            }
+            body.impulse = store(scale(step, wrench));
+        }
+    }
+    for (index, dead) in workspace.loads.iter().enumerate() {
+        for g in 0..groups {
+            let body = &mut workspace.bodies[dead.body * groups + g];
+            let step = Lane::load(simd, &workspace.weights[g]);
+            let (force, arm) = load_arm(simd, dead, &workspace.load_forces[index * groups + g], body);
+            let mut wrench = join(cross(arm, force), force);
+            if dead.couple {
+                let zero = Lane::splat(simd, 0.0);
+                wrench = join(cross(arm, force), [zero; 3]);
+            }
+            body.impulse = store(crate::lanes::scale_add(step, wrench, load(simd, &body.impulse)));
+        }
+    }
+}
+
+/// Force of a dead load and the arm it acts on: from the origin of {0} to the point, or the couple's own arm.
+#[inline(always)]
+pub(crate) fn load_arm<S: Simd>(
+    simd: S,
+    dead: &DeadLoad,
+    force: &[Quad; 3],
+    body: &BodyLanes,
+) -> (Lane3<S>, Lane3<S>) {
+    let rotation = load(simd, &body.rotation);
+    let arm_b = splat(simd, &dead.arm_b);
+    let arm = if dead.couple {
+        mat_vec(&rotation, arm_b)
+    } else {
+        mat_vec_add(&rotation, arm_b, load(simd, &body.position))
+    };
+    (load(simd, force), arm)
+}
+
+/// Drag and constant wrench in link axes at the mass centre, moved to the origin of {0}.
+#[inline(always)]
+fn body_fixed_wrench<S: Simd>(simd: S, constants: &BodyConstants, body: &BodyLanes) -> Lane6<S> {
+    let zero = Lane::splat(simd, 0.0);
+    let rotation: Lane9<S> = load(simd, &body.rotation);
+    let position: Lane3<S> = load(simd, &body.position);
+    let mut wrench_b = constants.constant_wrench.map_or([zero; 6], |w| splat(simd, &w));
+    if let Some(drag) = &constants.drag {
+        let drag: Lane6<S> = splat(simd, drag);
+        let (omega, linear) = halves(load(simd, &body.velocity));
+        let central = sub(linear, cross(position, omega));
+        let velocity_b = join(mat_tr_vec(&rotation, omega), mat_tr_vec(&rotation, central));
+        for k in 0..6 {
+            wrench_b[k] = drag[k].neg_mul_add(velocity_b[k], wrench_b[k]);
+        }
+    }
+    let (torque, force) = halves(wrench_b);
+    let force = mat_vec(&rotation, force);
+    join(cross_add(position, force, mat_vec(&rotation, torque)), force)
+}
+
+/// `F_ν -= Ad_g⁻ᵀ C Ad_g⁻¹` for the diagonal drag `C` in link axes at the mass centre.
+#[inline(always)]
+fn add_drag_gain<S: Simd>(simd: S, drag: &[f64; 6], body: &BodyLanes, gain: &mut GainLanes) {
+    let rotation: Lane9<S> = load(simd, &body.rotation);
+    let position: Lane3<S> = load(simd, &body.position);
+    let nu: [Lane<S>; 36] = load(simd, &gain.nu);
+    let drag: Lane6<S> = splat(simd, drag);
+    let zero = Lane::splat(simd, 0.0);
+    let mut columns = [[zero; 6]; 6];
+    for (k, column) in columns.iter_mut().enumerate() {
+        let mut twist = [zero; 6];
+        twist[k] = Lane::splat(simd, 1.0);
+        let (omega, linear) = halves(twist);
+        let central = sub(linear, cross(position, omega));
+        let (spin_b, slip_b) = (mat_tr_vec(&rotation, omega), mat_tr_vec(&rotation, central));
+        let torque = mat_vec(&rotation, core::array::from_fn(|r| drag[r] * spin_b[r]));
+        let force = mat_vec(&rotation, core::array::from_fn(|r| drag[3 + r] * slip_b[r]));
+        *column = join(cross_add(position, force, torque), force);
+    }
+    gain.nu = core::array::from_fn(|k| (nu[k] - columns[k % 6][k / 6]).quad());
+}
+
+/// `Σ_β a^{αβ} m^β`, lanes over α of group `g`, for component `k` of the projections.
+#[inline(always)]
+pub(crate) fn weighted_sum<S: Simd>(
+    simd: S,
+    workspace: &DelWorkspace,
+    projections: &[[Quad; 6]],
+    k: usize,
+    g: usize,
+    start: Lane<S>,
+) -> Lane<S> {
+    let groups = workspace.groups;
+    let mut sum = start;
+    for beta in 0..=workspace.rule.unknown_nodes() {
+        let value = projections[beta / LANES][k].0[beta % LANES];
+        let column = Lane::load(simd, &workspace.weighted_derivative[beta * groups + g]);
+        sum = column.mul_add(Lane::splat(simd, value), sum);
+    }
+    sum
+}
+
+#[inline(always)]
+fn joint_row<S: Simd>(simd: S, tree: &KinematicTree, workspace: &mut DelWorkspace, i: usize, g: usize) {
+    let groups = workspace.groups;
+    let constants = &tree.constants()[i];
+    let dof = tree.joint_dof(i);
+    let body = &workspace.bodies[i * groups + g];
+    let joint = dof - tree.base_dof();
+    let mut held = Lane::load(simd, &workspace.joint_forces[joint * groups + g]);
+    let q_dot = Lane::load(simd, &workspace.q_dot[dof * groups + g]);
+    held = Lane::splat(simd, constants.damping).neg_mul_add(q_dot, held);
+    if constants.stiffness != 0.0 {
+        let stretch = Lane::load(simd, &workspace.q[dof * groups + g]) - Lane::splat(simd, constants.rest);
+        held = Lane::splat(simd, constants.stiffness).neg_mul_add(stretch, held);
+    }
+    held = held + dot6(load(simd, &body.joint_twist_rate), load(simd, &body.momentum));
+    let twist: Lane6<S> = load(simd, &body.joint_twist);
+    let row = Lane::load(simd, &workspace.weights[g]).mul_add(held, dot6(twist, load(simd, &body.impulse)));
+    workspace.rows[dof * groups + g] =
+        weighted_sum(simd, workspace, &workspace.projections, 0, g, row).quad();
+}
+
+#[inline(always)]
+fn base_rows<S: Simd>(simd: S, workspace: &mut DelWorkspace) {
+    let groups = workspace.groups;
+    let s = workspace.rule.unknown_nodes();
+    for g in 0..groups {
+        let momentum = load(simd, &workspace.bodies[g].momentum);
+        workspace.projections[g] = store(base_project(simd, &workspace.base[g], momentum));
+    }
+    for g in 0..groups {
+        let (body, base) = (&workspace.bodies[g], &workspace.base[g]);
+        let step = Lane::load(simd, &workspace.weights[g]);
+        let mut mask = Quad::splat(1.0);
+        if s / LANES == g {
+            mask.0[s % LANES] = 0.0;
+        }
+        let mask = Lane::load(simd, &mask);
+        let rate = base_project_rate(simd, base, load(simd, &body.momentum));
+        let pushed = scale(mask, base_project(simd, base, load(simd, &body.impulse)));
+        for k in 0..6 {
+            let start = if k < 3 { step.mul_add(rate[k], pushed[k]) } else { pushed[k] };
+            let row = weighted_sum(simd, workspace, &workspace.projections, k, g, start);
+            workspace.rows[k * groups + g] = row.quad();
+        }
+    }
+}

@@ -1,0 +1,408 @@
+//! SIMD lanes over the control nodes of a step.
+//!
+//! The recursions of the paper do the same arithmetic at every node `α = 0..s`. Here one lane is one node: a quantity of
+//! a body is stored as a [`Quad`] of four doubles (nodes 0..3; a rule with more nodes uses several quads, its *groups*),
+//! and the kernels are written once over a [`Simd`] token. The processor is asked once, when a workspace is built
+//! ([`Instructions::detect`]); a plain build still uses AVX2 and fused multiply-add where they exist.
+
+use core::ops::{Add, Mul, Neg, Sub};
+
+/// Lanes in a [`Quad`].
+pub(crate) const LANES: usize = 4;
+
+/// Four doubles, one per control node.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[repr(C, align(32))]
+pub(crate) struct Quad(pub [f64; LANES]);
+
+impl Quad {
+    pub const ZERO: Quad = Quad([0.0; LANES]);
+
+    pub const fn splat(x: f64) -> Self {
+        Quad([x; LANES])
+    }
+}
+
+/// Arithmetic on four lanes with one instruction set.
+pub(crate) trait Simd: Copy {
+    type Lanes: Copy;
+    fn splat(self, x: f64) -> Self::Lanes;
+    fn load(self, quad: &Quad) -> Self::Lanes;
+    fn store(self, lanes: Self::Lanes) -> Quad;
+    fn add(self, a: Self::Lanes, b: Self::Lanes) -> Self::Lanes;
+    fn sub(self, a: Self::Lanes, b: Self::Lanes) -> Self::Lanes;
+    fn mul(self, a: Self::Lanes, b: Self::Lanes) -> Self::Lanes;
+    /// `a b + c`.
+    fn mul_add(self, a: Self::Lanes, b: Self::Lanes, c: Self::Lanes) -> Self::Lanes;
+    /// `c - a b`.
+    fn neg_mul_add(self, a: Self::Lanes, b: Self::Lanes, c: Self::Lanes) -> Self::Lanes;
+}
+
+/// Plain arrays: what every processor can do.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Portable;
+
+#[inline(always)]
+fn zip(a: [f64; 4], b: [f64; 4], f: impl Fn(f64, f64) -> f64) -> [f64; 4] {
+    [f(a[0], b[0]), f(a[1], b[1]), f(a[2], b[2]), f(a[3], b[3])]
+}
+
+impl Simd for Portable {
+    type Lanes = [f64; 4];
+    #[inline(always)]
+    fn splat(self, x: f64) -> [f64; 4] {
+        [x; 4]
+    }
+    #[inline(always)]
+    fn load(self, quad: &Quad) -> [f64; 4] {
+        quad.0
+    }
+    #[inline(always)]
+    fn store(self, lanes: [f64; 4]) -> Quad {
+        Quad(lanes)
+    }
+    #[inline(always)]
+    fn add(self, a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
+        zip(a, b, |x, y| x + y)
+    }
+    #[inline(always)]
+    fn sub(self, a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
+        zip(a, b, |x, y| x - y)
+    }
+    #[inline(always)]
+    fn mul(self, a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
+        zip(a, b, |x, y| x * y)
+    }
+    #[inline(always)]
+    fn mul_add(self, a: [f64; 4], b: [f64; 4], c: [f64; 4]) -> [f64; 4] {
+        self.add(self.mul(a, b), c)
+    }
+    #[inline(always)]
+    fn neg_mul_add(self, a: [f64; 4], b: [f64; 4], c: [f64; 4]) -> [f64; 4] {
+        self.sub(c, self.mul(a, b))
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+impl Simd for pulp::x86::V3 {
+    type Lanes = pulp::f64x4;
+    #[inline(always)]
+    fn splat(self, x: f64) -> pulp::f64x4 {
+        self.splat_f64x4(x)
+    }
+    #[inline(always)]
+    fn load(self, quad: &Quad) -> pulp::f64x4 {
+        pulp::cast(quad.0)
+    }
+    #[inline(always)]
+    fn store(self, lanes: pulp::f64x4) -> Quad {
+        Quad(pulp::cast(lanes))
+    }
+    #[inline(always)]
+    fn add(self, a: pulp::f64x4, b: pulp::f64x4) -> pulp::f64x4 {
+        self.add_f64x4(a, b)
+    }
+    #[inline(always)]
+    fn sub(self, a: pulp::f64x4, b: pulp::f64x4) -> pulp::f64x4 {
+        self.sub_f64x4(a, b)
+    }
+    #[inline(always)]
+    fn mul(self, a: pulp::f64x4, b: pulp::f64x4) -> pulp::f64x4 {
+        self.mul_f64x4(a, b)
+    }
+    #[inline(always)]
+    fn mul_add(self, a: pulp::f64x4, b: pulp::f64x4, c: pulp::f64x4) -> pulp::f64x4 {
+        self.mul_add_f64x4(a, b, c)
+    }
+    #[inline(always)]
+    fn neg_mul_add(self, a: pulp::f64x4, b: pulp::f64x4, c: pulp::f64x4) -> pulp::f64x4 {
+        self.negate_mul_add_f64x4(a, b, c)
+    }
+}
+
+/// Work that runs under any instruction set. Implementations and all they call must be `#[inline(always)]`, so that
+/// the code is generated inside the function that enables the instructions.
+pub(crate) trait Kernel {
+    type Output;
+    fn run<S: Simd>(self, simd: S) -> Self::Output;
+}
+
+/// The instruction set the kernels use, found out once.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Instructions {
+    Portable,
+    #[cfg(target_arch = "x86_64")]
+    V3(pulp::x86::V3),
+}
+
+impl Instructions {
+    /// The best the processor offers.
+    pub fn detect() -> Self {
+        #[cfg(target_arch = "x86_64")]
+        if let Some(v3) = pulp::x86::V3::try_new() {
+            return Self::V3(v3);
+        }
+        Self::Portable
+    }
+
+    /// Runs a kernel with these instructions enabled.
+    #[inline(always)]
+    pub fn dispatch<K: Kernel>(self, kernel: K) -> K::Output {
+        match self {
+            Self::Portable => kernel.run(Portable),
+            #[cfg(target_arch = "x86_64")]
+            Self::V3(v3) => pulp::Simd::vectorize(v3, OnV3 { kernel, v3 }),
+        }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+struct OnV3<K> {
+    kernel: K,
+    v3: pulp::x86::V3,
+}
+
+#[cfg(target_arch = "x86_64")]
+impl<K: Kernel> pulp::WithSimd for OnV3<K> {
+    type Output = K::Output;
+    #[inline(always)]
+    fn with_simd<P: pulp::Simd>(self, _: P) -> K::Output {
+        self.kernel.run(self.v3)
+    }
+}
+
+/// Four lanes together with the token that may compute on them: gives the kernels ordinary operators.
+#[derive(Clone, Copy)]
+pub(crate) struct Lane<S: Simd> {
+    simd: S,
+    lanes: S::Lanes,
+}
+
+/// A 3-vector in every lane.
+pub(crate) type Lane3<S> = [Lane<S>; 3];
+/// A 6-vector (angular first) in every lane.
+pub(crate) type Lane6<S> = [Lane<S>; 6];
+/// A row-major 3x3 matrix in every lane.
+pub(crate) type Lane9<S> = [Lane<S>; 9];
+
+impl<S: Simd> Lane<S> {
+    #[inline(always)]
+    pub fn splat(simd: S, x: f64) -> Self {
+        Self { simd, lanes: simd.splat(x) }
+    }
+    #[inline(always)]
+    pub fn load(simd: S, quad: &Quad) -> Self {
+        Self { simd, lanes: simd.load(quad) }
+    }
+    #[inline(always)]
+    pub fn quad(self) -> Quad {
+        self.simd.store(self.lanes)
+    }
+    /// `self b + c`.
+    #[inline(always)]
+    pub fn mul_add(self, b: Self, c: Self) -> Self {
+        Self { lanes: self.simd.mul_add(self.lanes, b.lanes, c.lanes), ..self }
+    }
+    /// `c - self b`.
+    #[inline(always)]
+    pub fn neg_mul_add(self, b: Self, c: Self) -> Self {
+        Self { lanes: self.simd.neg_mul_add(self.lanes, b.lanes, c.lanes), ..self }
+    }
+}
+
+impl<S: Simd> Add for Lane<S> {
+    type Output = Self;
+    #[inline(always)]
+    fn add(self, rhs: Self) -> Self {
+        Self { lanes: self.simd.add(self.lanes, rhs.lanes), ..self }
+    }
+}
+
+impl<S: Simd> Sub for Lane<S> {
+    type Output = Self;
+    #[inline(always)]
+    fn sub(self, rhs: Self) -> Self {
+        Self { lanes: self.simd.sub(self.lanes, rhs.lanes), ..self }
+    }
+}
+
+impl<S: Simd> Mul for Lane<S> {
+    type Output = Self;
+    #[inline(always)]
+    fn mul(self, rhs: Self) -> Self {
+        Self { lanes: self.simd.mul(self.lanes, rhs.lanes), ..self }
+    }
+}
+
+impl<S: Simd> Neg for Lane<S> {
+    type Output = Self;
+    #[inline(always)]
+    fn neg(self) -> Self {
+        Self::splat(self.simd, 0.0) - self
+    }
+}
+
+/// Loads `N` consecutive quads.
+#[inline(always)]
+pub(crate) fn load<S: Simd, const N: usize>(simd: S, quads: &[Quad; N]) -> [Lane<S>; N] {
+    core::array::from_fn(|k| Lane::load(simd, &quads[k]))
+}
+
+/// The same constants in every lane.
+#[inline(always)]
+pub(crate) fn splat<S: Simd, const N: usize>(simd: S, values: &[f64; N]) -> [Lane<S>; N] {
+    core::array::from_fn(|k| Lane::splat(simd, values[k]))
+}
+
+/// Stores `N` lanes.
+#[inline(always)]
+pub(crate) fn store<S: Simd, const N: usize>(lanes: [Lane<S>; N]) -> [Quad; N] {
+    core::array::from_fn(|k| lanes[k].quad())
+}
+
+/// Element-wise sum.
+#[inline(always)]
+pub(crate) fn add<S: Simd, const N: usize>(a: [Lane<S>; N], b: [Lane<S>; N]) -> [Lane<S>; N] {
+    core::array::from_fn(|k| a[k] + b[k])
+}
+
+/// Element-wise difference.
+#[inline(always)]
+pub(crate) fn sub<S: Simd, const N: usize>(a: [Lane<S>; N], b: [Lane<S>; N]) -> [Lane<S>; N] {
+    core::array::from_fn(|k| a[k] - b[k])
+}
+
+/// `factor a`, element by element.
+#[inline(always)]
+pub(crate) fn scale<S: Simd, const N: usize>(factor: Lane<S>, a: [Lane<S>; N]) -> [Lane<S>; N] {
+    core::array::from_fn(|k| factor * a[k])
+}
+
+/// `factor a + b`, element by element.
+#[inline(always)]
+pub(crate) fn scale_add<S: Simd, const N: usize>(
+    factor: Lane<S>,
+    a: [Lane<S>; N],
+    b: [Lane<S>; N],
+) -> [Lane<S>; N] {
+    core::array::from_fn(|k| factor.mul_add(a[k], b[k]))
+}
+
+/// Scalar product of 3-vectors.
+#[inline(always)]
+pub(crate) fn dot3<S: Simd>(a: Lane3<S>, b: Lane3<S>) -> Lane<S> {
+    a[2].mul_add(b[2], a[1].mul_add(b[1], a[0] * b[0]))
+}
+
+/// Scalar product of 6-vectors.
+#[inline(always)]
+pub(crate) fn dot6<S: Simd>(a: Lane6<S>, b: Lane6<S>) -> Lane<S> {
+    let top = a[2].mul_add(b[2], a[1].mul_add(b[1], a[0] * b[0]));
+    let bottom = a[5].mul_add(b[5], a[4].mul_add(b[4], a[3] * b[3]));
+    top + bottom
+}
+
+/// `a × b`.
+#[inline(always)]
+pub(crate) fn cross<S: Simd>(a: Lane3<S>, b: Lane3<S>) -> Lane3<S> {
+    [
+        a[2].neg_mul_add(b[1], a[1] * b[2]),
+        a[0].neg_mul_add(b[2], a[2] * b[0]),
+        a[1].neg_mul_add(b[0], a[0] * b[1]),
+    ]
+}
+
+/// `a × b + c`.
+#[inline(always)]
+pub(crate) fn cross_add<S: Simd>(a: Lane3<S>, b: Lane3<S>, c: Lane3<S>) -> Lane3<S> {
+    [
+        a[2].neg_mul_add(b[1], a[1].mul_add(b[2], c[0])),
+        a[0].neg_mul_add(b[2], a[2].mul_add(b[0], c[1])),
+        a[1].neg_mul_add(b[0], a[0].mul_add(b[1], c[2])),
+    ]
+}
+
+/// Row-major matrix times vector.
+#[inline(always)]
+pub(crate) fn mat_vec<S: Simd>(m: &Lane9<S>, v: Lane3<S>) -> Lane3<S> {
+    core::array::from_fn(|r| dot3([m[3 * r], m[3 * r + 1], m[3 * r + 2]], v))
+}
+
+/// Row-major matrix times vector, plus a vector.
+#[inline(always)]
+pub(crate) fn mat_vec_add<S: Simd>(m: &Lane9<S>, v: Lane3<S>, b: Lane3<S>) -> Lane3<S> {
+    core::array::from_fn(|r| {
+        m[3 * r + 2].mul_add(v[2], m[3 * r + 1].mul_add(v[1], m[3 * r].mul_add(v[0], b[r])))
+    })
+}
+
+/// Transpose of a row-major matrix times vector.
+#[inline(always)]
+pub(crate) fn mat_tr_vec<S: Simd>(m: &Lane9<S>, v: Lane3<S>) -> Lane3<S> {
+    core::array::from_fn(|c| dot3([m[c], m[3 + c], m[6 + c]], v))
+}
+
+/// Product of row-major matrices.
+#[inline(always)]
+pub(crate) fn mat_mul<S: Simd>(a: &Lane9<S>, b: &Lane9<S>) -> Lane9<S> {
+    core::array::from_fn(|k| {
+        let (r, c) = (k / 3, k % 3);
+        dot3([a[3 * r], a[3 * r + 1], a[3 * r + 2]], [b[c], b[3 + c], b[6 + c]])
+    })
+}
+
+/// Symmetric matrix (xx, yy, zz, xy, xz, yz) times vector.
+#[inline(always)]
+pub(crate) fn sym_vec<S: Simd>(m: &Lane6<S>, v: Lane3<S>) -> Lane3<S> {
+    [dot3([m[0], m[3], m[4]], v), dot3([m[3], m[1], m[5]], v), dot3([m[4], m[5], m[2]], v)]
+}
+
+/// The two halves of a 6-vector.
+#[inline(always)]
+pub(crate) fn halves<S: Simd>(v: Lane6<S>) -> (Lane3<S>, Lane3<S>) {
+    ([v[0], v[1], v[2]], [v[3], v[4], v[5]])
+}
+
+/// A 6-vector from its halves.
+#[inline(always)]
+pub(crate) fn join<S: Simd>(top: Lane3<S>, bottom: Lane3<S>) -> Lane6<S> {
+    [top[0], top[1], top[2], bottom[0], bottom[1], bottom[2]]
+}
+
+/// The Lie bracket `ad_v x`.
+#[inline(always)]
+pub(crate) fn bracket<S: Simd>(v: Lane6<S>, x: Lane6<S>) -> Lane6<S> {
+    let ((w, l), (s, n)) = (halves(v), halves(x));
+    join(cross(w, s), cross_add(l, s, cross(w, n)))
+}
+
+/// The dual bracket `ad^D_F x = [τ×s + f×n; f×s]`.
+#[inline(always)]
+pub(crate) fn dual_bracket<S: Simd>(wrench: Lane6<S>, x: Lane6<S>) -> Lane6<S> {
+    let ((torque, force), (s, n)) = (halves(wrench), halves(x));
+    join(cross_add(torque, s, cross(force, n)), cross(force, s))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Sum<'a>(&'a [Quad; 2]);
+    impl Kernel for Sum<'_> {
+        type Output = [Quad; 3];
+        #[inline(always)]
+        fn run<S: Simd>(self, simd: S) -> [Quad; 3] {
+            let [a, b] = load(simd, self.0);
+            let c = cross([a, b, a], [b, a, b]);
+            [a.mul_add(b, -a).quad(), (a - b).quad(), c[0].quad()]
+        }
+    }
+
+    #[test]
+    fn every_instruction_set_gives_the_same_lanes() {
+        let quads = [Quad([1.0, 2.0, -3.0, 0.5]), Quad([4.0, 0.25, 2.0, 8.0])];
+        let expected = Instructions::Portable.dispatch(Sum(&quads));
+        assert_eq!(expected, Instructions::detect().dispatch(Sum(&quads)));
+        assert_eq!(expected[0].0, [3.0, -1.5, -3.0, 3.5]);
+    }
+}

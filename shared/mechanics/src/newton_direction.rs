@@ -1,0 +1,238 @@
+//! The Newton direction of the DEL equations, `J x = rhs`: one trait over three factorisations.
+//!
+//! | implementation | cost | choose it for |
+//! |---|---|---|
+//! | [`crate::branch_lu::BranchLu`] | O(s³ Σ depth²) factor, O(s² Σ depth) per solve | robots: many short branches |
+//! | [`crate::recursive_newton::RecursiveNewton`] (Algorithm B.1) | O(s³ n) factor, O(s² n) per solve | long chains |
+//! | [`crate::dense_lu::DenseNewton`] | O(s³ n³) | a pivot block that is singular although `J` is not; tests |
+//!
+//! Vectors are coordinate-major: entry `dof * s + α` of a right-hand side (`α = 0..s-1`), entry `dof * s + γ - 1` of a solution
+//! (`γ = 1..s`).
+
+use crate::branch_lu::BranchLu;
+use crate::del_hessian::DelHessian;
+use crate::del_residual::DelWorkspace;
+use crate::dense_lu::DenseNewton;
+use crate::errors::FactorError;
+use crate::recursive_newton::RecursiveNewton;
+use crate::row_matrix::RowMatrix;
+use crate::spatial::{Twist, Wrench};
+use crate::tree::KinematicTree;
+use nalgebra::{Matrix6, Vector6};
+
+/// A factorisation of the Newton matrix of one step.
+pub trait NewtonDirection {
+    /// Factorises `J` at the nodes last evaluated in `del`. No allocation.
+    ///
+    /// # Errors
+    /// [`FactorError::SingularPivot`] when a pivot block is singular to working precision.
+    fn factor(&mut self, tree: &KinematicTree, del: &DelWorkspace) -> Result<(), FactorError>;
+
+    /// `rhs := J⁻¹ rhs`.
+    fn solve(&mut self, tree: &KinematicTree, rhs: &mut [f64]);
+
+    /// `rhs := J⁻ᵀ rhs`.
+    fn solve_transposed(&mut self, tree: &KinematicTree, rhs: &mut [f64]);
+
+    /// `rhs := J⁻¹ rhs` for many columns.
+    fn solve_many(&mut self, tree: &KinematicTree, rhs: &mut RowMatrix);
+
+    /// The Hessian blocks behind the factorisation, where it has them.
+    fn hessian(&self) -> Option<&DelHessian>;
+}
+
+/// Which factorisation a step uses.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum NewtonMethod {
+    /// Branch-sparse block LU.
+    BranchLu,
+    /// Algorithm B.1.
+    Recursive,
+    /// Dense LU with pivoting.
+    Dense,
+}
+
+/// Root-mean-square depth above which Algorithm B.1 beats the branch LU, for s = 1, 2, 3, 4 and more.
+///
+/// Measured on chains and binary trees with `benches/newton_direction.rs`.
+const CROSSOVER_DEPTH: [f64; 4] = [40.0, 40.0, 40.0, 40.0];
+
+impl NewtonMethod {
+    /// The faster one for a tree and a number of unknown nodes, by measured crossover of the depth.
+    pub fn fastest(tree: &KinematicTree, unknown_nodes: usize) -> Self {
+        let bodies = tree.first_joint_body()..tree.body_count();
+        let sum: f64 = bodies.map(|i| (tree.branch(i).len() as f64).powi(2)).sum();
+        let limit = CROSSOVER_DEPTH[unknown_nodes.clamp(1, CROSSOVER_DEPTH.len()) - 1];
+        if sum > limit * limit * tree.joint_count().max(1) as f64 { Self::Recursive } else { Self::BranchLu }
+    }
+}
+
+/// One of the three, chosen at run time.
+#[derive(Clone, Debug)]
+#[allow(clippy::large_enum_variant)]
+pub enum NewtonSolver {
+    /// Branch-sparse block LU.
+    BranchLu(BranchLu),
+    /// Algorithm B.1.
+    Recursive(RecursiveNewton),
+    /// Dense LU with pivoting.
+    Dense(DenseNewton),
+}
+
+impl NewtonSolver {
+    /// Workspace of the given method for the steps of `del`.
+    pub fn new(method: NewtonMethod, tree: &KinematicTree, del: &DelWorkspace) -> Self {
+        match method {
+            NewtonMethod::BranchLu => Self::BranchLu(BranchLu::new(tree, del)),
+            NewtonMethod::Recursive => Self::Recursive(RecursiveNewton::new(tree, del)),
+            NewtonMethod::Dense => Self::Dense(DenseNewton::new(tree, del)),
+        }
+    }
+}
+
+macro_rules! each {
+    ($self:ident, $solver:ident => $call:expr) => {
+        match $self {
+            NewtonSolver::BranchLu($solver) => $call,
+            NewtonSolver::Recursive($solver) => $call,
+            NewtonSolver::Dense($solver) => $call,
+        }
+    };
+}
+
+impl NewtonDirection for NewtonSolver {
+    fn factor(&mut self, tree: &KinematicTree, del: &DelWorkspace) -> Result<(), FactorError> {
+        each!(self, solver => solver.factor(tree, del))
+    }
+    fn solve(&mut self, tree: &KinematicTree, rhs: &mut [f64]) {
+        each!(self, solver => solver.solve(tree, rhs))
+    }
+    fn solve_transposed(&mut self, tree: &KinematicTree, rhs: &mut [f64]) {
+        each!(self, solver => solver.solve_transposed(tree, rhs))
+    }
+    fn solve_many(&mut self, tree: &KinematicTree, rhs: &mut RowMatrix) {
+        each!(self, solver => solver.solve_many(tree, rhs))
+    }
+    fn hessian(&self) -> Option<&DelHessian> {
+        each!(self, solver => solver.hessian())
+    }
+}
+
+/// An entry of the Newton matrix in the rows or columns of the base.
+pub(crate) enum BaseEntry {
+    Set(f64),
+    Add(f64),
+}
+
+/// Everything in the Newton matrix of a floating tree that is not plainly `H[α,γ]` (module doc of [`crate::del_hessian`]).
+///
+/// Calls `put(row, column, entry)` in coordinate-major numbering: `Set` for all base-base entries and the joint columns of
+/// the base rows `α = 0`; `Add` for what comes on top of `H` in the base columns of the joint rows.
+pub(crate) fn jacobian_column_rule(
+    tree: &KinematicTree,
+    del: &DelWorkspace,
+    hessian: &DelHessian,
+    mut put: impl FnMut(usize, usize, BaseEntry),
+) {
+    let s = del.unknown_nodes();
+    let start_twists = base_matrix(del, 0);
+    let end_twists = base_matrix(del, s);
+    let last = s - 1;
+
+    for i in 1..tree.body_count() {
+        let dof = tree.joint_dof(i);
+        let first_pair = hessian.pair_starts[i];
+        for alpha in 0..s {
+            let shift = Vector6::from(hessian.shift_row(dof, alpha)).transpose() * start_twists;
+            for k in 0..6 {
+                let change = shift[k] - hessian.entry(first_pair + k, alpha, 0);
+                put(dof * s + alpha, k * s + last, BaseEntry::Add(change));
+            }
+        }
+        for gamma in 1..=s {
+            let impulse = Vector6::from(hessian.impulse_column(dof, gamma));
+            let projected = end_twists.tr_mul(&impulse);
+            for k in 0..6 {
+                let ahead =
+                    hessian.mirrored(first_pair + k, 0, gamma) - hessian.mirrored(first_pair + k, s, gamma);
+                put(k * s, dof * s + gamma - 1, BaseEntry::Set(ahead + projected[k]));
+            }
+        }
+    }
+
+    // Change of the total impulse by δξ^s through the rigid shift S^0 δξ^s and through δξ^0 = -δξ^s.
+    let mut shifted_impulse = Matrix6::from_fn(|r, k| -hessian.impulse_column(k, 0)[r]);
+    for alpha in 0..=s {
+        shifted_impulse += base_gain(del, hessian, alpha) * start_twists;
+    }
+    let momentum_end = {
+        let (_, impulse) = del.body_momentum_and_impulse(0, s);
+        del.base_momentum_before_end() + impulse
+    };
+    let turned = dual_matrix(&momentum_end) * (end_twists + start_twists);
+    let curved =
+        second_order_matrix(del, s, &momentum_end) - second_order_matrix(del, 0, &del.start_momentum());
+    let last_column = end_twists.tr_mul(&(shifted_impulse + turned)) + curved;
+    let shift_at = |alpha: usize| {
+        let rows = Matrix6::from_fn(|k, c| hessian.shift_row(k, alpha)[c]);
+        rows * start_twists
+    };
+    let (shift_first, shift_last) = (shift_at(0), shift_at(s));
+    for k in 0..6 {
+        for l in 0..6 {
+            for gamma in 1..=s {
+                for alpha in 1..s {
+                    let mut value = hessian.base_entry(k, l, alpha, gamma);
+                    if gamma == s {
+                        value += shift_at(alpha)[(k, l)] - hessian.base_entry(k, l, alpha, 0);
+                    }
+                    put(k * s + alpha, l * s + gamma - 1, BaseEntry::Set(value));
+                }
+                let impulse = Vector6::from(hessian.impulse_column(l, gamma));
+                let mut value = hessian.base_entry(k, l, 0, gamma) - hessian.base_entry(k, l, s, gamma)
+                    + end_twists.column(k).dot(&impulse);
+                if gamma == s {
+                    value += last_column[(k, l)] + shift_first[(k, l)]
+                        - shift_last[(k, l)]
+                        - (hessian.base_entry(k, l, 0, 0) - hessian.base_entry(k, l, s, 0));
+                }
+                put(k * s, l * s + gamma - 1, BaseEntry::Set(value));
+            }
+        }
+    }
+}
+
+/// `S^α` of the base as a matrix.
+pub(crate) fn base_matrix(del: &DelWorkspace, alpha: usize) -> Matrix6<f64> {
+    // Sᵀ applied to unit wrenches gives its columns' entries row by row.
+    let mut rows = Matrix6::zeros();
+    for r in 0..6 {
+        let unit = Wrench::from_vector(&Vector6::ith(r, 1.0));
+        rows.set_row(r, &Vector6::from(del.project_base(alpha, &unit)).transpose());
+    }
+    rows
+}
+
+/// Matrix of `ad^D_X`.
+fn dual_matrix(x: &Wrench) -> Matrix6<f64> {
+    let mut m = Matrix6::zeros();
+    for c in 0..6 {
+        m.set_column(c, &x.dual_bracket(&Twist::from_vector(&Vector6::ith(c, 1.0))).to_vector());
+    }
+    m
+}
+
+/// `(𝒴 - ad^D_Γ)^α` of the base, times `w_α Δt`.
+fn base_gain(del: &DelWorkspace, hessian: &DelHessian, alpha: usize) -> Matrix6<f64> {
+    // The shift rows hold Sᵀ𝒴 of the base: solve for 𝒴 by the inverse of Sᵀ.
+    let rows = Matrix6::from_fn(|k, c| hessian.shift_row(k, alpha)[c]);
+    let (_, impulse) = del.body_momentum_and_impulse(0, alpha);
+    let twists = base_matrix(del, alpha);
+    let gain = twists.transpose().lu().solve(&rows).unwrap_or_else(Matrix6::zeros);
+    gain - dual_matrix(&impulse)
+}
+
+/// `N^α(X)` of the base as a matrix.
+pub(crate) fn second_order_matrix(del: &DelWorkspace, alpha: usize, x: &Wrench) -> Matrix6<f64> {
+    del.instructions.dispatch(crate::floating_base::SecondOrderMatrix { base: &del.base, alpha, wrench: x })
+}
