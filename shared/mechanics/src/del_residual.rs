@@ -96,7 +96,8 @@ pub struct DelWorkspace {
     pub(crate) derivative: Vec<Quad>,
     /// `a^{αβ}`, lanes over α: `[β * groups + g]`.
     pub(crate) weighted_derivative: Vec<Quad>,
-    /// Coordinates at the nodes: `[dof * groups + g]`; a floating base holds its chart `ξ` here.
+    /// Joint coordinates at the nodes relative to the start of the step, `q^α - q^0`, and the chart `ξ^α` of a floating base:
+    /// `[dof * groups + g]`. Rates come from differences, which would lose digits in the coordinates themselves.
     pub(crate) q: Vec<Quad>,
     pub(crate) q_dot: Vec<Quad>,
     pub(crate) joint_forces: Vec<Quad>,
@@ -226,11 +227,7 @@ impl DelWorkspace {
         self.check_inputs(tree, state, forces)?;
         self.start.copy_from(state);
         let groups = self.groups;
-        let base = tree.base_dof();
-        for (dof, &q) in state.q.iter().enumerate() {
-            self.q[(base + dof) * groups..(base + dof + 1) * groups].fill(Quad::splat(q));
-        }
-        self.q[..base * groups].fill(Quad::ZERO);
+        self.q.fill(Quad::ZERO);
         self.set_joint_forces(tree, &forces.joints);
         self.loads.clear();
         self.load_forces.clear();
@@ -339,7 +336,14 @@ impl DelWorkspace {
     /// Coordinate `dof` at node `alpha`: joint coordinate, or chart coordinate of a floating base.
     #[inline]
     pub fn node(&self, alpha: usize, dof: usize) -> f64 {
-        self.q[dof * self.groups + alpha / LANES].0[alpha % LANES]
+        self.origin(dof) + self.q[dof * self.groups + alpha / LANES].0[alpha % LANES]
+    }
+
+    /// Joint coordinate at the start of the step; 0 for the chart of a floating base.
+    #[inline(always)]
+    fn origin(&self, dof: usize) -> f64 {
+        let base = self.start.p.len() - self.start.q.len();
+        if dof < base { 0.0 } else { self.start.q[dof - base] }
     }
 
     /// Rate of coordinate `dof` at node `alpha`.
@@ -351,7 +355,14 @@ impl DelWorkspace {
     /// Sets coordinate `dof` at node `alpha` (1..=s). Node 0 of a floating base's chart follows node s by itself.
     #[inline]
     pub fn set_node(&mut self, alpha: usize, dof: usize, value: f64) {
-        self.q[dof * self.groups + alpha / LANES].0[alpha % LANES] = value;
+        let origin = self.origin(dof);
+        self.q[dof * self.groups + alpha / LANES].0[alpha % LANES] = value - origin;
+    }
+
+    /// Moves coordinate `dof` at node `alpha` (1..=s); keeps the digits of a change that is small beside the coordinate.
+    #[inline]
+    pub fn move_node(&mut self, alpha: usize, dof: usize, change: f64) {
+        self.q[dof * self.groups + alpha / LANES].0[alpha % LANES] += change;
     }
 
     /// Pose of the body frame (link axes, origin at the mass centre) at node `alpha`, in {0}; valid after [`evaluate`].
@@ -553,7 +564,7 @@ impl Kernel for Outward<'_> {
     }
 }
 
-/// `q̇^α = (1/Δt) Σ_β b^{αβ} (q^β - q^0)`: the rows of `b` sum to zero, and differences keep the digits.
+/// `q̇^α = (1/Δt) Σ_β b^{αβ} (q^β - q^0)`: the rows of `b` sum to zero.
 #[inline(always)]
 pub(crate) fn rates<S: Simd>(
     simd: S,
@@ -598,7 +609,8 @@ fn joint_outward<S: Simd>(simd: S, tree: &KinematicTree, workspace: &mut DelWork
     let groups = workspace.groups;
     let constants = &tree.constants()[i];
     let dof = tree.joint_dof(i) * groups + g;
-    let q = workspace.q[dof];
+    let origin = workspace.start.q[tree.joint_dof(i) - tree.base_dof()];
+    let q = Quad(workspace.q[dof].0.map(|change| origin + change));
     let q_dot = Lane::load(simd, &workspace.q_dot[dof]);
 
     let mut e: Lane9<S> = splat(simd, &constants.e0);
@@ -840,7 +852,8 @@ fn joint_row<S: Simd>(simd: S, tree: &KinematicTree, workspace: &mut DelWorkspac
     let q_dot = Lane::load(simd, &workspace.q_dot[dof * groups + g]);
     held = Lane::splat(simd, constants.damping).neg_mul_add(q_dot, held);
     if constants.stiffness != 0.0 {
-        let stretch = Lane::load(simd, &workspace.q[dof * groups + g]) - Lane::splat(simd, constants.rest);
+        let rest = constants.rest - workspace.start.q[joint];
+        let stretch = Lane::load(simd, &workspace.q[dof * groups + g]) - Lane::splat(simd, rest);
         held = Lane::splat(simd, constants.stiffness).neg_mul_add(stretch, held);
     }
     held = held + dot6(load(simd, &body.joint_twist_rate), load(simd, &body.momentum));

@@ -180,12 +180,12 @@ pub enum StepError {
     },
     /// Newton converged to a solution that is not the continuation of the motion.
     #[error(
-        "the step turns joint or base coordinate {dof} by {change} (limit {limit}): a spurious solution; use a smaller time step"
+        "coordinate {dof} ends {change} rad from its extrapolation (limit {limit}): a spurious solution; use a smaller time step"
     )]
     SpuriousSolution {
         /// Coordinate index.
         dof: usize,
-        /// Its change over the step.
+        /// Its distance from the guess (a floating base: its rotation), rad.
         change: f64,
         /// The largest change accepted.
         limit: f64,

@@ -1,0 +1,488 @@
+//! One step of the variational integrator: Newton's method on the DEL equations.
+//!
+//! | letter | meaning |
+//! |---|---|
+//! | `q^1..q^s` | unknown nodes of the step (a floating base: chart coordinates `ξ^1..ξ^s`) |
+//! | `r` | DEL residual, [`crate::del_residual`] |
+//! | `J` | Newton matrix, [`crate::newton_direction`] |
+//! | `θ` | contraction: size of a change relative to the one before |
+//!
+//! **Start.** The interpolation polynomial of the step before is extrapolated, `q^α := Σ_β l_β(1 + c_α) q_prev^β`, when the step
+//! continues where the last one ended; else `q^α = q^0 + c_α Δt M⁻¹p`; if Newton fails from there, `q^α = q^0`.
+//!
+//! **Iteration.** `J` is factorised at the start and kept while the iteration contracts (simplified Newton); Broyden's update
+//! on top of the factors costs a few scalar products and saves about one iteration. `J` is renewed when `θ` exceeds
+//! 0.1.
+//!
+//! **Stop.** On the change, never on the residual: its floor `~10 ε max|a^{αβ} Sᵀμ|` grows with the length of the chain. Done
+//! when the next change is predicted below `1e-14 (1 + max|q|)`, or below `1e-8` and no longer shrinking.
+//!
+//! Source: the paper, section 3.2 (there `δq = -J r`; the inverse is missing in print); Broyden's method in the form of
+//! C. T. Kelley, *Iterative Methods for Linear and Nonlinear Equations*, SIAM 1995, section 7.3.
+
+use alloc::vec;
+use alloc::vec::Vec;
+
+use crate::del_residual::{DelWorkspace, ForceCapacity};
+use crate::dense_lu::DenseNewton;
+use crate::errors::{FactorError, ModelError, StepError};
+use crate::floating_base::MAX_HALF_ROTATION;
+use crate::forces::StepForces;
+use crate::lobatto::LobattoRule;
+use crate::newton_direction::{NewtonDirection, NewtonMethod, NewtonSolver};
+use crate::real::sqrt;
+use crate::state::State;
+use crate::tree::{JointKind, KinematicTree};
+use crate::velocity::VelocityWorkspace;
+
+/// The next change is predicted below this (times `1 + max|q|`): converged.
+const PREDICTED_CHANGE: f64 = 1e-14;
+/// A change below this (times `1 + max|q|`) is converged without prediction.
+const SMALL_CHANGE: f64 = 1e-12;
+/// Below this the iteration may stop when it no longer shrinks: round-off.
+const STAGNATION_CHANGE: f64 = 1e-8;
+/// Contraction above which the Newton matrix is renewed.
+const RENEW_CONTRACTION: f64 = 0.1;
+/// Broyden's update remembers this many changes.
+const BROYDEN_MEMORY: usize = 8;
+
+/// How the Newton matrix is used from one iteration to the next.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum NewtonVariant {
+    /// Factorised anew in every iteration.
+    Exact,
+    /// Factorised once, renewed when the contraction is poor.
+    Simplified,
+    /// As `Simplified`, with Broyden's rank-one updates.
+    Broyden,
+}
+
+/// What is fixed when an [`Integrator`] is made.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StepOptions {
+    /// Factorisation; `None` takes [`NewtonMethod::fastest`].
+    pub method: Option<NewtonMethod>,
+    /// Use of the Newton matrix.
+    pub variant: NewtonVariant,
+    /// Iterations after which the step fails.
+    pub max_iterations: usize,
+    /// A revolute joint may end a step this far (rad) from where the guess put it; solutions beyond are refused as spurious.
+    pub turn_limit: f64,
+    /// Room for forces outside the model.
+    pub forces: ForceCapacity,
+    /// Coordinates times nodes up to which a dense LU stands by for states where a leaf-to-root pivot is singular.
+    pub dense_fallback: usize,
+}
+
+impl Default for StepOptions {
+    fn default() -> Self {
+        Self {
+            method: None,
+            variant: NewtonVariant::Broyden,
+            max_iterations: 40,
+            turn_limit: 1.0,
+            forces: ForceCapacity::default(),
+            dense_fallback: 128,
+        }
+    }
+}
+
+/// What a step took.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct StepReport {
+    /// Newton iterations (residual evaluations with a solve).
+    pub iterations: usize,
+    /// Factorisations of the Newton matrix.
+    pub factorizations: usize,
+    /// Largest absolute entry of the last change.
+    pub last_change: f64,
+}
+
+/// The variational integrator of one tree, rule and time step, with all its memory.
+///
+/// # Example
+/// ```
+/// use delmpc_mechanics::prelude::*;
+/// let rod = LinkInertia::new(1.0, Vector3::new(0.0, 0.0, -0.5), Matrix3::from_diagonal(&Vector3::new(0.09, 0.09, 0.002)));
+/// let mut builder = TreeBuilder::fixed_base(Vector3::new(0.0, 0.0, -9.81));
+/// let upper = builder.add(Body::new(None, Joint::revolute(Vector3::y(), RigidTransform::identity()), rod));
+/// let elbow = RigidTransform::from_translation(Vector3::new(0.0, 0.0, -1.0));
+/// builder.add(Body::new(Some(upper), Joint::revolute(Vector3::y(), elbow), rod));
+/// let tree = builder.build()?;
+/// let mut integrator = Integrator::new(&tree, &LobattoRule::new(2)?, 0.01, StepOptions::default())?;
+/// let mut state = State::zeros(&tree);
+/// state.q = vec![0.6, -0.3];
+/// for _ in 0..100 {
+///     integrator.step(&tree, &mut state, &StepForces::held(&[0.0, 0.0]))?;
+/// }
+/// # let (kinetic, potential) = integrator.velocities().energy(&tree, &state)?;
+/// # assert!((kinetic + potential + 9.81 * (1.5 * 0.6f64.cos() + 0.5 * 0.3f64.cos())).abs() < 1e-5);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Clone, Debug)]
+pub struct Integrator {
+    del: DelWorkspace,
+    solver: NewtonSolver,
+    dense: Option<DenseNewton>,
+    use_dense: bool,
+    velocities: VelocityWorkspace,
+    options: StepOptions,
+    direction: Vec<f64>,
+    rate: Vec<f64>,
+    next: State,
+    /// `l_β(1 + c_α)`, row α.
+    extrapolation: Vec<f64>,
+    /// Nodes of the last step, coordinate-major, and the state it ended in.
+    previous_nodes: Vec<f64>,
+    previous_end: State,
+    has_previous: bool,
+    /// Where the guess put node s.
+    guessed_end: Vec<f64>,
+    changes: Vec<f64>,
+}
+
+impl Integrator {
+    /// For steps of `time_step` (s) of `tree` by `rule`.
+    ///
+    /// # Errors
+    /// [`ModelError::TimeStep`] for a step that is not positive and finite.
+    pub fn new(
+        tree: &KinematicTree,
+        rule: &LobattoRule,
+        time_step: f64,
+        options: StepOptions,
+    ) -> Result<Self, ModelError> {
+        let del = DelWorkspace::new(tree, rule, time_step, options.forces)?;
+        let s = rule.unknown_nodes();
+        let order = s * tree.dof();
+        let method = options.method.unwrap_or_else(|| NewtonMethod::fastest(tree, s));
+        let dense = (order <= options.dense_fallback && method != NewtonMethod::Dense)
+            .then(|| DenseNewton::new(tree, &del));
+        let mut extrapolation = vec![0.0; (s + 1) * (s + 1)];
+        for (alpha, &c) in rule.nodes().iter().enumerate() {
+            for beta in 0..=s {
+                extrapolation[alpha * (s + 1) + beta] = rule.lagrange(beta, 1.0 + c);
+            }
+        }
+        Ok(Self {
+            solver: NewtonSolver::new(method, tree, &del),
+            dense,
+            use_dense: false,
+            velocities: VelocityWorkspace::new(tree),
+            options,
+            direction: vec![0.0; order],
+            rate: vec![0.0; tree.dof()],
+            next: State::zeros(tree),
+            extrapolation,
+            previous_nodes: vec![0.0; (s + 1) * tree.dof()],
+            previous_end: State::zeros(tree),
+            has_previous: false,
+            guessed_end: vec![0.0; tree.dof()],
+            changes: vec![0.0; BROYDEN_MEMORY * order],
+            del,
+        })
+    }
+
+    /// Advances `state` by one step. On an error the state is untouched. No allocation.
+    ///
+    /// # Errors
+    /// [`StepError`]: not converged, singular Newton matrix, input not finite, spurious solution, wrong lengths.
+    pub fn step(
+        &mut self,
+        tree: &KinematicTree,
+        state: &mut State,
+        forces: &StepForces<'_>,
+    ) -> Result<StepReport, StepError> {
+        let report = self.solve(tree, state, forces)?;
+        state.copy_from(&self.next);
+        Ok(report)
+    }
+
+    /// Solves the DEL equations of one step from `state` without advancing it: the nodes are in [`Integrator::del`], the new
+    /// state is [`Integrator::next_state`].
+    ///
+    /// # Errors
+    /// As [`Integrator::step`].
+    pub fn solve(
+        &mut self,
+        tree: &KinematicTree,
+        state: &State,
+        forces: &StepForces<'_>,
+    ) -> Result<StepReport, StepError> {
+        self.del.begin(tree, state, forces)?;
+        self.use_dense = false;
+        let continues = self.has_previous && *state == self.previous_end;
+        self.has_previous = false;
+        let mut report = StepReport::default();
+        if continues {
+            self.guess_by_extrapolation(tree);
+            if self.newton(tree, forces, &mut report).is_ok() && self.accept(tree).is_ok() {
+                return self.keep(tree, report);
+            }
+        }
+        self.guess_by_velocity(tree, state)?;
+        let mut outcome = self.newton(tree, forces, &mut report).and_then(|()| self.accept(tree));
+        if outcome.is_err() {
+            self.guess_at_rest(tree);
+            let retry = self.newton(tree, forces, &mut report).and_then(|()| self.accept(tree));
+            outcome = if retry.is_ok() { retry } else { outcome };
+        }
+        outcome?;
+        self.keep(tree, report)
+    }
+
+    /// Forgets the last step: the next one starts from the velocity.
+    pub fn forget(&mut self) {
+        self.has_previous = false;
+    }
+
+    /// Changes the time step (s).
+    ///
+    /// # Errors
+    /// [`ModelError::TimeStep`] unless positive and finite.
+    pub fn set_time_step(&mut self, time_step: f64) -> Result<(), ModelError> {
+        self.forget();
+        self.del.set_time_step(time_step)
+    }
+
+    /// The nodes of the last step and everything evaluated at them.
+    pub fn del(&self) -> &DelWorkspace {
+        &self.del
+    }
+
+    /// State at the end of the last solved step.
+    pub fn next_state(&self) -> &State {
+        &self.next
+    }
+
+    /// The factorisation in use.
+    pub fn solver(&mut self) -> &mut NewtonSolver {
+        &mut self.solver
+    }
+
+    /// Nodes and factorisation together, for work on a solved step.
+    pub fn del_and_solver(&mut self) -> (&mut DelWorkspace, &mut NewtonSolver) {
+        (&mut self.del, &mut self.solver)
+    }
+
+    /// Velocities, momenta and energies of states.
+    pub fn velocities(&mut self) -> &mut VelocityWorkspace {
+        &mut self.velocities
+    }
+
+    fn guess_by_extrapolation(&mut self, tree: &KinematicTree) {
+        let count = self.del.unknown_nodes() + 1;
+        for dof in 0..tree.dof() {
+            let nodes = &self.previous_nodes[dof * count..(dof + 1) * count];
+            for alpha in 1..count {
+                let value = if dof < tree.base_dof() {
+                    // The chart moves with the body: the same rotation and travel once more.
+                    nodes[alpha]
+                } else {
+                    let row = &self.extrapolation[alpha * count..(alpha + 1) * count];
+                    row.iter().zip(nodes).map(|(l, q)| l * q).sum()
+                };
+                self.del.set_node(alpha, dof, value);
+            }
+        }
+    }
+
+    fn guess_by_velocity(&mut self, tree: &KinematicTree, state: &State) -> Result<(), StepError> {
+        self.velocities.velocity_into(tree, state, &mut self.rate)?;
+        let step = self.del.time_step();
+        for alpha in 1..=self.del.unknown_nodes() {
+            let c = self.del.rule().nodes()[alpha];
+            for joint in 0..tree.joint_count() {
+                let dof = tree.base_dof() + joint;
+                self.del.set_node(alpha, dof, state.q[joint] + c * step * self.rate[dof]);
+            }
+            if tree.is_floating() {
+                let half = self.half_motion(state);
+                for (k, value) in half.iter().enumerate() {
+                    self.del.set_node(alpha, k, (2.0 * c - 1.0) * value);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Half a step of the base at constant body velocity, in the chart centred in the middle of the step.
+    fn half_motion(&self, state: &State) -> [f64; 6] {
+        let vector = |at: usize| nalgebra::Vector3::new(self.rate[at], self.rate[at + 1], self.rate[at + 2]);
+        let (omega, linear) = (vector(0), vector(3));
+        let pose = &state.base_pose;
+        let half = 0.5 * self.del.time_step();
+        let turn = pose.rotation.tr_mul(&omega) * half;
+        let center = pose.rotation * crate::spatial::exp_rotation(&turn);
+        let travel = center.tr_mul(&(linear + omega.cross(&pose.translation))) * half;
+        [turn.x, turn.y, turn.z, travel.x, travel.y, travel.z]
+    }
+
+    fn guess_at_rest(&mut self, tree: &KinematicTree) {
+        for alpha in 1..=self.del.unknown_nodes() {
+            for dof in 0..tree.dof() {
+                let value = if dof < tree.base_dof() { 0.0 } else { self.del.node(0, dof) };
+                self.del.set_node(alpha, dof, value);
+            }
+        }
+    }
+
+    fn factor(&mut self, tree: &KinematicTree, report: &mut StepReport) -> Result<(), FactorError> {
+        report.factorizations += 1;
+        if !self.use_dense {
+            match (self.solver.factor(tree, &self.del), &self.dense) {
+                (Ok(()), _) => return Ok(()),
+                (Err(error), None) => return Err(error),
+                // The leaf-to-root pivots fail where pivoting over the whole matrix need not.
+                (Err(_), Some(_)) => self.use_dense = true,
+            }
+        }
+        match &mut self.dense {
+            Some(dense) => dense.factor(tree, &self.del),
+            None => self.solver.factor(tree, &self.del),
+        }
+    }
+
+    fn newton(
+        &mut self,
+        tree: &KinematicTree,
+        forces: &StepForces<'_>,
+        report: &mut StepReport,
+    ) -> Result<(), StepError> {
+        let s = self.del.unknown_nodes();
+        let order = s * tree.dof();
+        for (dof, end) in self.guessed_end.iter_mut().enumerate() {
+            *end = self.del.node(s, dof);
+        }
+        let mut last_change = f64::INFINITY;
+        let mut remembered = 0;
+        let mut fresh = false;
+        let mut residual = f64::INFINITY;
+        for iteration in 0..self.options.max_iterations {
+            self.del.evaluate(tree, forces.laws);
+            self.del.residual_into(tree, &mut self.direction);
+            residual = self.direction.iter().fold(0.0f64, |m, x| m.max(x.abs()));
+            if let Some(index) = self.direction.iter().position(|x| !x.is_finite()) {
+                return Err(StepError::NonFinite { quantity: "DEL residual (coordinate * s + node)", index });
+            }
+            if iteration == 0 || self.options.variant == NewtonVariant::Exact || !fresh {
+                self.factor(tree, report)?;
+                fresh = true;
+                remembered = 0;
+            }
+            match (&mut self.dense, self.use_dense) {
+                (Some(dense), true) => dense.solve(tree, &mut self.direction),
+                _ => self.solver.solve(tree, &mut self.direction),
+            }
+            for x in &mut self.direction {
+                *x = -*x;
+            }
+            if self.options.variant == NewtonVariant::Broyden {
+                self.broyden(order, &mut remembered);
+            }
+            report.iterations += 1;
+            let mut size = 1.0f64;
+            let mut change = 0.0f64;
+            for dof in 0..tree.dof() {
+                for alpha in 1..=s {
+                    let delta = self.direction[dof * s + alpha - 1];
+                    self.del.move_node(alpha, dof, delta);
+                    size = size.max(1.0 + self.del.node(alpha, dof).abs());
+                    change = change.max(delta.abs());
+                }
+            }
+            report.last_change = change;
+            if !change.is_finite() {
+                return Err(StepError::NotConverged { residual, change, iterations: report.iterations });
+            }
+            let contraction = change / last_change;
+            let predicted = change * contraction;
+            if change <= SMALL_CHANGE * size
+                || (iteration > 0 && predicted <= PREDICTED_CHANGE * size)
+                || (change < STAGNATION_CHANGE * size && contraction > 0.5)
+            {
+                self.del.evaluate(tree, forces.laws);
+                return Ok(());
+            }
+            fresh = contraction < RENEW_CONTRACTION || iteration == 0;
+            last_change = change;
+        }
+        Err(StepError::NotConverged { residual, change: last_change, iterations: report.iterations })
+    }
+
+    /// Broyden's method on top of the factors: turns `-J_0⁻¹ r` into the quasi-Newton change, and remembers it.
+    fn broyden(&mut self, order: usize, remembered: &mut usize) {
+        let square = |x: &[f64]| x.iter().map(|v| v * v).sum::<f64>();
+        for j in 0..*remembered {
+            let own = &self.changes[j * order..(j + 1) * order];
+            let inner: f64 = own.iter().zip(&self.direction).map(|(a, b)| a * b).sum();
+            let factor = inner / square(own);
+            if j + 1 < *remembered {
+                let next = &self.changes[(j + 1) * order..(j + 2) * order];
+                for (x, n) in self.direction.iter_mut().zip(next) {
+                    *x += factor * n;
+                }
+            } else {
+                // A change that turns back on the last one: no update (the plain simplified step is kept).
+                let scale = 1.0 - factor;
+                if scale.abs() > 0.1 {
+                    for x in &mut self.direction {
+                        *x /= scale;
+                    }
+                }
+            }
+        }
+        if *remembered < BROYDEN_MEMORY {
+            self.changes[*remembered * order..(*remembered + 1) * order].copy_from_slice(&self.direction);
+            *remembered += 1;
+        }
+    }
+
+    /// Refuses solutions that are not the continuation of the motion.
+    fn accept(&self, tree: &KinematicTree) -> Result<(), StepError> {
+        let s = self.del.unknown_nodes();
+        if tree.is_floating() {
+            let half = sqrt((0..3).map(|k| self.del.node(s, k) * self.del.node(s, k)).sum());
+            if half > MAX_HALF_ROTATION {
+                let limit = 2.0 * MAX_HALF_ROTATION;
+                return Err(StepError::SpuriousSolution { dof: 0, change: 2.0 * half, limit });
+            }
+        }
+        for (body, spec) in tree.bodies().iter().enumerate().skip(tree.first_joint_body()) {
+            if spec.joint.kind != JointKind::Revolute {
+                continue;
+            }
+            let dof = tree.joint_dof(body);
+            let change = (self.del.node(s, dof) - self.guessed_end[dof]).abs();
+            let limit = self.options.turn_limit;
+            if change > limit {
+                return Err(StepError::SpuriousSolution { dof, change, limit });
+            }
+        }
+        Ok(())
+    }
+
+    fn keep(&mut self, tree: &KinematicTree, report: StepReport) -> Result<StepReport, StepError> {
+        let count = self.del.unknown_nodes() + 1;
+        self.del.next_state_into(tree, &mut self.next);
+        for dof in 0..tree.dof() {
+            for alpha in 0..count {
+                self.previous_nodes[dof * count + alpha] = self.del.node(alpha, dof);
+            }
+        }
+        self.previous_end.copy_from(&self.next);
+        self.has_previous = true;
+        Ok(report)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use core::mem::size_of;
+
+    #[test]
+    fn reports_stay_small() {
+        assert!(size_of::<StepReport>() <= 24 && size_of::<StepError>() <= 64);
+    }
+}

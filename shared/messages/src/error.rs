@@ -1,0 +1,153 @@
+//! Why a message was refused.
+
+/// A message that cannot be used. Each text says which message, where in it, how much, and what to do.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum MessageError {
+    /// The first word is not that of the expected message type.
+    #[error(
+        "{message}: first word is {found:#010x}, expected {expected:#010x}: this is another message or damaged memory; \
+         check that both ends of the link use the same message type"
+    )]
+    WrongMagic {
+        /// The expected message.
+        message: &'static str,
+        /// The word found.
+        found: u32,
+        /// The word of the expected message.
+        expected: u32,
+    },
+    /// Another version of the same message.
+    #[error("{message}: version {found}, expected {expected}: build both processes from the same source")]
+    WrongVersion {
+        /// The expected message.
+        message: &'static str,
+        /// The version found.
+        found: u32,
+        /// The version of this build.
+        expected: u32,
+    },
+    /// The sender has other joints, or the same joints in another order.
+    #[error(
+        "{message}: joint set {found:#018x}, expected {expected:#018x}: the sender has other joints or another order; \
+         give both processes the same robot file"
+    )]
+    WrongJointSet {
+        /// The expected message.
+        message: &'static str,
+        /// The hash in the message.
+        found: u64,
+        /// The hash of our joint set.
+        expected: u64,
+    },
+    /// The number of joints differs from ours or exceeds the capacity.
+    #[error(
+        "{message}: {found} joints, expected {expected} (at most 32 fit); give both processes the same robot file"
+    )]
+    WrongJointCount {
+        /// The expected message.
+        message: &'static str,
+        /// Joints in the message.
+        found: usize,
+        /// Joints of our robot.
+        expected: usize,
+    },
+    /// A value is NaN or infinite.
+    #[error(
+        "{message}: {field}[{index}] = {value} is not finite; look at the sender, nothing was taken over from this message"
+    )]
+    NotFinite {
+        /// The refused message.
+        message: &'static str,
+        /// The field.
+        field: &'static str,
+        /// Index in the field; a gain counts row by row.
+        index: usize,
+        /// The value.
+        value: f64,
+    },
+    /// A value is finite but beyond anything a robot does.
+    #[error(
+        "{message}: {field}[{index}] = {value:e} is beyond {limit:e}; look at the sender, nothing was taken over from this message"
+    )]
+    Implausible {
+        /// The refused message.
+        message: &'static str,
+        /// The field.
+        field: &'static str,
+        /// Index in the field; a gain counts row by row.
+        index: usize,
+        /// The value.
+        value: f64,
+        /// The largest magnitude accepted.
+        limit: f64,
+    },
+    /// A quaternion is not of unit length.
+    #[error(
+        "{message}: {field} has squared length {squared_norm}, expected 1 within {tolerance:e}; normalise it before sending"
+    )]
+    NotUnit {
+        /// The refused message.
+        message: &'static str,
+        /// The field.
+        field: &'static str,
+        /// Its squared length.
+        squared_norm: f64,
+        /// The tolerance on the squared length.
+        tolerance: f64,
+    },
+    /// A code that stands for nothing.
+    #[error("{message}: {field} = {value} is no known code; build both processes from the same source")]
+    UnknownCode {
+        /// The refused message.
+        message: &'static str,
+        /// The field.
+        field: &'static str,
+        /// The code.
+        value: u32,
+    },
+    /// A command that ends before it begins.
+    #[error(
+        "{message}: valid from {from_ns} ns until {until_ns} ns, an empty interval; look at the clock of the sender"
+    )]
+    EmptyInterval {
+        /// The refused message.
+        message: &'static str,
+        /// Begin of the interval.
+        from_ns: u64,
+        /// End of the interval.
+        until_ns: u64,
+    },
+    /// A slice handed in by the caller has another length than the message has joints.
+    #[error(
+        "{message}: argument {argument} has length {found}, expected {expected}, the joints of this message"
+    )]
+    WrongLength {
+        /// The message.
+        message: &'static str,
+        /// The argument.
+        argument: &'static str,
+        /// Its length.
+        found: usize,
+        /// The length needed.
+        expected: usize,
+    },
+}
+
+impl MessageError {
+    /// A number for [`crate::Command::reason`], never 0. It stays the same from version to version.
+    pub fn code(&self) -> u32 {
+        match self {
+            Self::WrongMagic { .. } => 1,
+            Self::WrongVersion { .. } => 2,
+            Self::WrongJointSet { .. } => 3,
+            Self::WrongJointCount { .. } => 4,
+            Self::NotFinite { .. } => 5,
+            Self::Implausible { .. } => 6,
+            Self::NotUnit { .. } => 7,
+            Self::UnknownCode { .. } => 8,
+            Self::EmptyInterval { .. } => 9,
+            Self::WrongLength { .. } => 10,
+        }
+    }
+}

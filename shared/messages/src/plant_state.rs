@@ -1,0 +1,138 @@
+//! Plant to controller: what the sensors say and what the actuators did.
+
+use bytemuck::{Pod, Zeroable};
+#[cfg(feature = "shared_memory")]
+use iceoryx2::prelude::ZeroCopySend;
+
+use crate::header::message;
+use crate::{
+    FallbackLevel, Header, LARGEST_COORDINATE, LARGEST_EFFORT, MAX_JOINTS, Message, MessageError, check,
+};
+
+/// One measurement of the whole robot.
+///
+/// | field | meaning | unit | frame |
+/// |---|---|---|---|
+/// | `position`, `velocity` | joints, in the order of the joint set | rad or m, per s | joint |
+/// | `base_position_w`, `base_orientation_w` | origin and axes of the base link frame (the root link, the pelvis of Atlas) | m, 1 | world |
+/// | `base_angular_velocity_b`, `base_linear_velocity_b` | velocity of the base link frame and of its origin | rad/s, m/s | base link |
+/// | `stance_torque_b`, `stance_force_b` | wrench of the ground *on* the stance foot, torque about the sole frame's origin | N m, N | sole |
+/// | `applied_torque` | torque the actuators gave during the step before `time_ns` | N m or N | joint |
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+#[cfg_attr(feature = "shared_memory", derive(ZeroCopySend), type_name("delmpc/PlantState/v1"))]
+pub struct PlantState {
+    /// Type, joint set, run, sequence.
+    pub header: Header,
+    /// Time at which the measured values were true, by the plant's clock (ns).
+    pub time_ns: u64,
+    /// Sequence of the [`crate::Command`] applied last; 0: none yet.
+    pub applied_command_sequence: u64,
+    /// Which clock `time_ns` is read from: [`ClockKind`].
+    pub clock: u32,
+    /// Joints in use, the first ones of each array.
+    pub n_joints: u32,
+    /// Index in the robot's contact table of the foot the stance wrench belongs to.
+    pub stance_foot: u32,
+    /// Bit i is set while foot i of the robot's contact table touches the ground.
+    pub contact_flags: u32,
+    /// What happened so far: bits of [`status`].
+    pub status_flags: u32,
+    /// Level of the plant's own watchdog: [`FallbackLevel`].
+    pub watchdog_level: u32,
+    /// Joint positions.
+    pub position: [f64; MAX_JOINTS],
+    /// Joint velocities.
+    pub velocity: [f64; MAX_JOINTS],
+    /// Joint torques applied last.
+    pub applied_torque: [f64; MAX_JOINTS],
+    /// Origin of the base link frame in the world.
+    pub base_position_w: [f64; 3],
+    /// Orientation of the base link frame in the world: unit quaternion x, y, z, w.
+    pub base_orientation_w: [f64; 4],
+    /// Angular velocity of the base link, in its own axes.
+    pub base_angular_velocity_b: [f64; 3],
+    /// Velocity of the origin of the base link frame, in the axes of the base link.
+    pub base_linear_velocity_b: [f64; 3],
+    /// Torque of the ground on the stance foot about the origin of the sole frame, in the axes of the sole.
+    pub stance_torque_b: [f64; 3],
+    /// Force of the ground on the stance foot, in the axes of the sole.
+    pub stance_force_b: [f64; 3],
+}
+
+message!(PlantState, "delmpc/PlantState/v1", b"DMPS", 1);
+
+/// Bits of [`PlantState::status_flags`].
+pub mod status {
+    /// The robot fell. Stays set until the end of the run.
+    pub const FELL: u32 = 1 << 0;
+    /// The plant has reached the end of the run and sends no further state.
+    pub const FINISHED: u32 = 1 << 1;
+    /// The plant's watchdog ignored the controller in the last step, since its commands were late, missing or refused.
+    pub const WATCHDOG: u32 = 1 << 2;
+    /// At least one actuator was at its limit in the last step.
+    pub const SATURATED: u32 = 1 << 3;
+    /// A disturbance acted in the last step.
+    pub const DISTURBED: u32 = 1 << 4;
+}
+
+/// What a plant's time is measured by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u32)]
+pub enum ClockKind {
+    /// Simulated time from 0, advanced step by step (`lockstep`).
+    Simulated = 0,
+    /// The machine's monotonic clock (`realtime`).
+    Monotonic = 1,
+}
+
+impl ClockKind {
+    /// The kind with this code, if there is one.
+    pub fn from_code(code: u32) -> Option<Self> {
+        [Self::Simulated, Self::Monotonic].into_iter().find(|kind| *kind as u32 == code)
+    }
+}
+
+impl PlantState {
+    /// A state at rest at the world's origin, with sequence 0 and `n_joints` joints at 0.
+    pub fn new(run_id: u64, joint_set_hash: u64, n_joints: u32) -> Self {
+        Self {
+            header: Header::new::<Self>(run_id, joint_set_hash),
+            n_joints,
+            base_orientation_w: [0.0, 0.0, 0.0, 1.0],
+            ..Self::zeroed()
+        }
+    }
+
+    /// Checks everything that can be checked without knowing the past: type, version, joint set and count, codes, every number
+    /// finite and plausible, the quaternion of unit length. Freshness is the receiver's business: it knows the last sequence and time.
+    ///
+    /// Cost: O(n), no allocation.
+    ///
+    /// # Errors
+    /// The first thing found wrong, by name.
+    pub fn validate(&self, expected_joint_set_hash: u64, n_joints: usize) -> Result<(), MessageError> {
+        self.header.validate::<Self>(expected_joint_set_hash)?;
+        let n = check::joint_count(Self::NAME, self.n_joints, n_joints)?;
+        check::known(Self::NAME, "clock", self.clock, ClockKind::from_code(self.clock))?;
+        let level = FallbackLevel::from_code(self.watchdog_level);
+        check::known(Self::NAME, "watchdog_level", self.watchdog_level, level)?;
+
+        let coordinate = |field, values| check::plausible(Self::NAME, field, values, LARGEST_COORDINATE);
+        let effort = |field, values| check::plausible(Self::NAME, field, values, LARGEST_EFFORT);
+        coordinate("position", &self.position[..n])?;
+        coordinate("velocity", &self.velocity[..n])?;
+        effort("applied_torque", &self.applied_torque[..n])?;
+        coordinate("base_position_w", &self.base_position_w)?;
+        check::unit_quaternion(Self::NAME, "base_orientation_w", &self.base_orientation_w)?;
+        coordinate("base_angular_velocity_b", &self.base_angular_velocity_b)?;
+        coordinate("base_linear_velocity_b", &self.base_linear_velocity_b)?;
+        effort("stance_torque_b", &self.stance_torque_b)?;
+        effort("stance_force_b", &self.stance_force_b)
+    }
+
+    /// Whether all the given bits of [`status`] are set.
+    pub fn has_status(&self, flags: u32) -> bool {
+        self.status_flags & flags == flags
+    }
+}

@@ -1,0 +1,280 @@
+//! Every field that can be wrong is refused by name; unused entries are not looked at; the feedback law is the documented one.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // helpers of tests, too
+
+use delmpc_messages::{
+    ClockKind, Command, ConstraintKind, FallbackLevel, Heartbeat, MAX_JOINTS, Message, MessageError,
+    PlantState, ProcessState, Role, Verdict, joint_set_hash, status,
+};
+
+const N: usize = 3;
+const HASH: u64 = joint_set_hash(&["hip", "knee", "ankle"]);
+const RUN: u64 = 7;
+
+fn state() -> PlantState {
+    PlantState::new(RUN, HASH, N as u32)
+}
+
+fn command() -> Command {
+    let mut command = Command::new(RUN, HASH, N as u32);
+    command.valid_from_ns = 1_000;
+    command.valid_until_ns = 2_000;
+    command
+}
+
+fn state_error(damage: impl FnOnce(&mut PlantState)) -> MessageError {
+    let mut state = state();
+    damage(&mut state);
+    state.validate(HASH, N).expect_err("the damage must be refused")
+}
+
+fn command_error(damage: impl FnOnce(&mut Command)) -> MessageError {
+    let mut command = command();
+    damage(&mut command);
+    command.validate(HASH, N).expect_err("the damage must be refused")
+}
+
+/// Field, index, "NaN", "infinite" or "huge" of a numeric refusal.
+fn place(error: MessageError) -> (&'static str, usize, &'static str) {
+    match error {
+        MessageError::NotFinite { field, index, value, .. } if value.is_nan() => (field, index, "NaN"),
+        MessageError::NotFinite { field, index, .. } => (field, index, "infinite"),
+        MessageError::Implausible { field, index, .. } => (field, index, "huge"),
+        other => panic!("not a numeric refusal: {other}"),
+    }
+}
+
+const BAD: [(f64, &str); 4] =
+    [(f64::NAN, "NaN"), (f64::INFINITY, "infinite"), (f64::NEG_INFINITY, "infinite"), (-1e300, "huge")];
+
+#[test]
+fn new_messages_are_valid() {
+    assert_eq!(state().validate(HASH, N), Ok(()));
+    assert_eq!(command().validate(HASH, N), Ok(()));
+    assert_eq!(Heartbeat::new(RUN, HASH, Role::Plant, 1).validate(HASH), Ok(()));
+    assert_eq!(Heartbeat::new(RUN, 0, Role::Supervisor, 1).validate(0), Ok(()));
+}
+
+#[test]
+fn another_message_type_is_refused() {
+    let expected = PlantState::MAGIC;
+    let error = state_error(|s| s.header.magic = Command::MAGIC);
+    assert_eq!(
+        error,
+        MessageError::WrongMagic { message: PlantState::NAME, found: Command::MAGIC, expected }
+    );
+    assert!(matches!(command_error(|c| c.header.magic = 0), MessageError::WrongMagic { found: 0, .. }));
+}
+
+#[test]
+fn another_version_is_refused() {
+    let error = state_error(|s| s.header.version = 2);
+    assert_eq!(error, MessageError::WrongVersion { message: PlantState::NAME, found: 2, expected: 1 });
+    assert_eq!(
+        error.to_string(),
+        "delmpc/PlantState/v1: version 2, expected 1: build both processes from the same source"
+    );
+    assert!(matches!(command_error(|c| c.header.version = 9), MessageError::WrongVersion { found: 9, .. }));
+}
+
+#[test]
+fn another_joint_set_is_refused() {
+    let other = joint_set_hash(&["knee", "hip", "ankle"]);
+    let error = state_error(|s| s.header.joint_set_hash = other);
+    assert_eq!(
+        error,
+        MessageError::WrongJointSet { message: PlantState::NAME, found: other, expected: HASH }
+    );
+    assert!(error.to_string().contains("the same robot file"), "{error}");
+    assert!(matches!(
+        command_error(|c| c.header.joint_set_hash = other),
+        MessageError::WrongJointSet { message: Command::NAME, .. }
+    ));
+}
+
+#[test]
+fn another_joint_count_is_refused_also_beyond_the_capacity() {
+    let error = state_error(|s| s.n_joints = 4);
+    assert_eq!(error, MessageError::WrongJointCount { message: PlantState::NAME, found: 4, expected: 3 });
+    assert!(matches!(command_error(|c| c.n_joints = 0), MessageError::WrongJointCount { found: 0, .. }));
+
+    let mut too_many = state();
+    too_many.n_joints = 33;
+    assert!(matches!(too_many.validate(HASH, 33), Err(MessageError::WrongJointCount { .. })));
+}
+
+type StateField = (&'static str, usize, fn(&mut PlantState) -> &mut [f64]);
+type CommandField = (&'static str, fn(&mut Command) -> &mut [f64]);
+
+#[test]
+fn every_number_of_a_state_is_checked_by_name_and_index() {
+    let fields: [StateField; 9] = [
+        ("position", N, |s| &mut s.position),
+        ("velocity", N, |s| &mut s.velocity),
+        ("applied_torque", N, |s| &mut s.applied_torque),
+        ("base_position_w", 3, |s| &mut s.base_position_w),
+        ("base_orientation_w", 4, |s| &mut s.base_orientation_w),
+        ("base_angular_velocity_b", 3, |s| &mut s.base_angular_velocity_b),
+        ("base_linear_velocity_b", 3, |s| &mut s.base_linear_velocity_b),
+        ("stance_torque_b", 3, |s| &mut s.stance_torque_b),
+        ("stance_force_b", 3, |s| &mut s.stance_force_b),
+    ];
+    for (name, length, field) in fields {
+        for index in 0..length {
+            for (value, kind) in BAD {
+                let error = state_error(|s| field(s)[index] = value);
+                assert_eq!(place(error), (name, index, kind));
+            }
+        }
+    }
+}
+
+#[test]
+fn every_number_of_a_command_is_checked_by_name_and_index() {
+    let fields: [CommandField; 3] = [
+        ("torque", |c| &mut c.torque),
+        ("position_ref", |c| &mut c.position_ref),
+        ("velocity_ref", |c| &mut c.velocity_ref),
+    ];
+    for (value, kind) in BAD {
+        for (name, field) in fields {
+            for index in 0..N {
+                assert_eq!(place(command_error(|c| field(c)[index] = value)), (name, index, kind));
+            }
+        }
+        for (row, column) in [(0, 0), (2, 2), (1, MAX_JOINTS), (2, MAX_JOINTS + 2)] {
+            let error = command_error(|c| c.gain[row][column] = value);
+            assert_eq!(place(error), ("gain", row * 2 * MAX_JOINTS + column, kind));
+        }
+    }
+    let error = command_error(|c| c.report.worst_violation = f64::NAN);
+    assert_eq!(place(error), ("report.worst_violation", 0, "NaN"));
+}
+
+#[test]
+fn unused_entries_are_not_looked_at() {
+    let mut state = state();
+    state.position[N] = f64::NAN;
+    assert_eq!(state.validate(HASH, N), Ok(()));
+
+    let mut command = command();
+    command.torque[N] = f64::NAN;
+    command.gain[N][0] = f64::NAN;
+    command.gain[0][N] = f64::NAN;
+    command.gain[0][MAX_JOINTS + N] = f64::NAN;
+    assert_eq!(command.validate(HASH, N), Ok(()));
+}
+
+#[test]
+fn a_quaternion_off_unit_length_is_refused() {
+    let error = state_error(|s| s.base_orientation_w = [0.0, 0.0, 0.0, 1.01]);
+    assert!(matches!(error, MessageError::NotUnit { field: "base_orientation_w", .. }), "{error}");
+    let error = state_error(|s| s.base_orientation_w = [0.0; 4]);
+    assert!(matches!(error, MessageError::NotUnit { squared_norm: 0.0, .. }), "{error}");
+}
+
+#[test]
+fn unknown_codes_are_refused_by_name() {
+    let unknown = |error| match error {
+        MessageError::UnknownCode { field, value: 77, .. } => field,
+        other => panic!("not an unknown code: {other}"),
+    };
+    assert_eq!(unknown(state_error(|s| s.clock = 77)), "clock");
+    assert_eq!(unknown(state_error(|s| s.watchdog_level = 77)), "watchdog_level");
+    assert_eq!(unknown(command_error(|c| c.verdict = 77)), "verdict");
+    assert_eq!(unknown(command_error(|c| c.fallback_level = 77)), "fallback_level");
+    assert_eq!(unknown(command_error(|c| c.report.worst_constraint = 77)), "report.worst_constraint");
+
+    let mut heartbeat = Heartbeat::new(RUN, HASH, Role::Plant, 1);
+    heartbeat.role = 77;
+    assert_eq!(unknown(heartbeat.validate(HASH).unwrap_err()), "role");
+    let mut heartbeat = Heartbeat::new(RUN, HASH, Role::Plant, 1);
+    heartbeat.state = 77;
+    assert_eq!(unknown(heartbeat.validate(HASH).unwrap_err()), "state");
+}
+
+#[test]
+fn a_command_that_ends_before_it_begins_is_refused() {
+    let error = command_error(|c| c.valid_until_ns = 999);
+    assert_eq!(error, MessageError::EmptyInterval { message: Command::NAME, from_ns: 1_000, until_ns: 999 });
+}
+
+#[test]
+fn a_command_is_valid_from_its_begin_up_to_but_not_at_its_end() {
+    let command = command();
+    assert!(!command.is_valid_at(999));
+    assert!(command.is_valid_at(1_000));
+    assert!(command.is_valid_at(1_999));
+    assert!(!command.is_valid_at(2_000));
+    assert!(!Command::new(RUN, HASH, N as u32).is_valid_at(0), "a new command is valid at no time");
+}
+
+#[test]
+fn every_code_reads_back_as_itself_and_the_next_one_is_unknown() {
+    for verdict in
+        [Verdict::Ok, Verdict::Late, Verdict::Infeasible, Verdict::ModelMismatch, Verdict::BadState]
+    {
+        assert_eq!(Verdict::from_code(verdict as u32), Some(verdict));
+    }
+    assert_eq!(Verdict::from_code(5), None);
+    for level in 0..=5 {
+        assert_eq!(FallbackLevel::from_code(level).map(|l| l as u32), Some(level));
+    }
+    assert_eq!(FallbackLevel::from_code(6), None);
+    for kind in 0..=7 {
+        assert_eq!(ConstraintKind::from_code(kind).map(|k| k as u32), Some(kind));
+    }
+    assert_eq!(ConstraintKind::from_code(8), None);
+    for state in 0..=5 {
+        assert_eq!(ProcessState::from_code(state).map(|s| s as u32), Some(state));
+    }
+    assert_eq!(ProcessState::from_code(6), None);
+    for role in Role::ALL {
+        assert_eq!(Role::from_code(role as u32), Some(role));
+    }
+    assert_eq!(Role::from_code(3), None);
+    assert_eq!(ClockKind::from_code(1), Some(ClockKind::Monotonic));
+    assert_eq!(ClockKind::from_code(2), None);
+}
+
+#[test]
+fn the_feedback_law_is_feed_forward_plus_gain_times_error() {
+    let mut command = command();
+    command.torque[..N].copy_from_slice(&[1.0, 2.0, 3.0]);
+    command.position_ref[..N].copy_from_slice(&[0.1, 0.2, 0.3]);
+    command.velocity_ref[..N].copy_from_slice(&[-1.0, 0.0, 1.0]);
+    command.gain[0][1] = 10.0;
+    command.gain[2][MAX_JOINTS] = -4.0;
+    let mut torque = [0.0; N];
+    command.torque_into(&[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0], &mut torque).unwrap();
+    assert_eq!(torque, [1.0 + 10.0 * (0.7 - 0.2), 2.0, 3.0 - 4.0 * 2.0]);
+}
+
+#[test]
+fn the_feedback_law_refuses_slices_of_another_length_and_counts_beyond_the_capacity() {
+    let mut command = command();
+    let mut torque = [5.0; N];
+    let error = command.torque_into(&[0.0; 2], &[0.0; N], &mut torque).unwrap_err();
+    assert!(matches!(error, MessageError::WrongLength { argument: "position", found: 2, expected: 3, .. }));
+    assert_eq!(torque, [5.0; N], "a refused call changes nothing");
+
+    command.n_joints = 1_000;
+    assert!(command.torque_into(&[0.0; 1_000], &[0.0; 1_000], &mut [0.0; 1_000]).is_err());
+}
+
+#[test]
+fn status_flags_are_single_bits() {
+    let all = [status::FELL, status::FINISHED, status::WATCHDOG, status::SATURATED, status::DISTURBED];
+    assert_eq!(all.iter().sum::<u32>(), all.iter().fold(0, |bits, flag| bits | flag));
+    let mut state = state();
+    state.status_flags = status::FELL | status::SATURATED;
+    assert!(state.has_status(status::FELL) && state.has_status(status::FELL | status::SATURATED));
+    assert!(!state.has_status(status::FELL | status::FINISHED));
+}
+
+#[test]
+fn codes_of_refusals_are_never_zero() {
+    assert_eq!(state_error(|s| s.header.magic = 0).code(), 1);
+    assert_eq!(state_error(|s| s.position[0] = f64::NAN).code(), 5);
+    assert_eq!(state_error(|s| s.position[0] = 1e300).code(), 6);
+}

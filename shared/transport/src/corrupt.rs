@@ -1,0 +1,82 @@
+//! How to damage a message.
+
+use delmpc_messages::{Command, MAX_JOINTS, Message, PlantState};
+
+/// A message that [`crate::FaultInjector`] can damage.
+pub trait Corrupt: Message {
+    /// Moves the times in the message by `shift_ns`.
+    fn shift_time(&mut self, shift_ns: i64);
+
+    /// Overwrites one of the numbers in use, chosen by `choice`.
+    fn set_number(&mut self, choice: u64, value: f64);
+
+    /// Says that the message has one joint more than it has.
+    fn add_joint(&mut self);
+}
+
+impl Corrupt for PlantState {
+    fn shift_time(&mut self, shift_ns: i64) {
+        self.time_ns = self.time_ns.saturating_add_signed(shift_ns);
+    }
+
+    fn set_number(&mut self, choice: u64, value: f64) {
+        let n = joints(self.n_joints);
+        let numbers = [
+            &mut self.position[..n],
+            &mut self.velocity[..n],
+            &mut self.base_position_w,
+            &mut self.base_orientation_w,
+            &mut self.base_angular_velocity_b,
+            &mut self.base_linear_velocity_b,
+            &mut self.stance_torque_b,
+            &mut self.stance_force_b,
+        ];
+        set_one(numbers, choice, value);
+    }
+
+    fn add_joint(&mut self) {
+        self.n_joints = self.n_joints.wrapping_add(1);
+    }
+}
+
+impl Corrupt for Command {
+    fn shift_time(&mut self, shift_ns: i64) {
+        for time in [&mut self.state_time_ns, &mut self.valid_from_ns, &mut self.valid_until_ns] {
+            *time = time.saturating_add_signed(shift_ns);
+        }
+    }
+
+    fn set_number(&mut self, choice: u64, value: f64) {
+        let n = joints(self.n_joints);
+        let row = choice as usize % n.max(1);
+        let (position_gain, velocity_gain) = self.gain[row].split_at_mut(MAX_JOINTS);
+        let numbers = [
+            &mut self.torque[..n],
+            &mut self.position_ref[..n],
+            &mut self.velocity_ref[..n],
+            &mut position_gain[..n],
+            &mut velocity_gain[..n],
+        ];
+        set_one(numbers, choice, value);
+    }
+
+    fn add_joint(&mut self) {
+        self.n_joints = self.n_joints.wrapping_add(1);
+    }
+}
+
+fn joints(n_joints: u32) -> usize {
+    (n_joints as usize).min(MAX_JOINTS)
+}
+
+/// Counts through the slices one after the other, and round again.
+fn set_one<const FIELDS: usize>(numbers: [&mut [f64]; FIELDS], choice: u64, value: f64) {
+    let total: usize = numbers.iter().map(|field| field.len()).sum();
+    if total == 0 {
+        return;
+    }
+    let chosen = (choice % total as u64) as usize;
+    if let Some(number) = numbers.into_iter().flatten().nth(chosen) {
+        *number = value;
+    }
+}
