@@ -400,10 +400,25 @@ impl DelWorkspace {
             self.center_chart();
         }
         let instructions = self.instructions;
-        instructions.dispatch(Outward { tree, workspace: self });
+        instructions.dispatch(Outward { tree, workspace: self, interpolate: true });
         if !self.gains.is_empty() {
             self.evaluate_laws(laws);
         }
+        instructions.dispatch(Inward { tree, workspace: self });
+    }
+
+    /// Poses, velocities and articulated momenta of a fixed-base tree at separate states instead of nodes: lane `k` gets
+    /// `(q, q̇)` number `k`.
+    pub(crate) fn evaluate_states(&mut self, tree: &KinematicTree, states: &[(&[f64], &[f64])]) {
+        self.start.q.fill(0.0);
+        for (lane, (q, q_dot)) in states.iter().enumerate() {
+            for dof in 0..tree.dof() {
+                self.q[dof * self.groups].0[lane] = q[dof];
+                self.q_dot[dof * self.groups].0[lane] = q_dot[dof];
+            }
+        }
+        let instructions = self.instructions;
+        instructions.dispatch(Outward { tree, workspace: self, interpolate: false });
         instructions.dispatch(Inward { tree, workspace: self });
     }
 
@@ -543,16 +558,20 @@ fn add_matrix(target: &mut [Quad; 36], matrix: &Matrix6<f64>, lane: usize) {
 struct Outward<'a> {
     tree: &'a KinematicTree,
     workspace: &'a mut DelWorkspace,
+    /// Take the rates from the nodes; otherwise they are given.
+    interpolate: bool,
 }
 
 impl Kernel for Outward<'_> {
     type Output = ();
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let Self { tree, workspace } = self;
+        let Self { tree, workspace, interpolate } = self;
         let groups = workspace.groups;
         let s = workspace.rule.unknown_nodes();
-        rates(simd, &workspace.derivative, groups, s, &workspace.q, &mut workspace.q_dot);
+        if interpolate {
+            rates(simd, &workspace.derivative, groups, s, &workspace.q, &mut workspace.q_dot);
+        }
         for g in 0..groups {
             if tree.is_floating() {
                 base_outward(simd, tree, workspace, g);

@@ -224,8 +224,18 @@ impl Kinematics {
     pub fn inertia_w(&self, tree: &KinematicTree, body: usize) -> SpatialInertia {
         let inertia = &tree.bodies()[body].inertia;
         let rotation = &self.link_pose_w[body].rotation;
-        let about_mass_centre = rotation * inertia.inertia * rotation.transpose();
-        SpatialInertia::from_central(inertia.mass, &self.mass_centre_w[body], &about_mass_centre)
+        let com = &self.mass_centre_w[body];
+        // J = R I Rᵀ + m (c·c 1 - c cᵀ)
+        let first_moment = com * inertia.mass;
+        let mut rotational = rotation * inertia.inertia * rotation.transpose();
+        let square = first_moment.dot(com);
+        for row in 0..3 {
+            for column in 0..3 {
+                rotational[(row, column)] -= first_moment[row] * com[column];
+            }
+            rotational[(row, row)] += square;
+        }
+        SpatialInertia { mass: inertia.mass, first_moment, rotational }
     }
 
     /// A point given in the link frame of `body`, in {0}, m.

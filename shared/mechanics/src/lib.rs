@@ -17,6 +17,7 @@ pub mod inverse_dynamics;
 pub mod kinematics;
 pub mod kinetic_hessian;
 pub(crate) mod lanes;
+pub mod linearize;
 pub mod lobatto;
 pub mod mass_matrix;
 pub mod mass_matrix_factor;
@@ -37,6 +38,7 @@ pub mod velocity;
 pub mod prelude {
     pub use crate::errors::{FactorError, ModelError, StepError};
     pub use crate::forces::{JointForces, PointForce, StepForces, WrenchLaw};
+    pub use crate::linearize::{InputHold, LinearStep, Linearizer, StateCoordinates};
     pub use crate::lobatto::LobattoRule;
     pub use crate::newton_direction::{NewtonDirection, NewtonMethod};
     pub use crate::spatial::{Momentum, RigidTransform, SpatialInertia, Twist, Wrench};

@@ -74,11 +74,19 @@ pub fn mass_matrix_into(
         }
         let row = tree.joint_dof(i);
         let momentum = composite[i].mul_twist(&kinematics.joint_twists_w()[i]);
-        for &column in tree.branch(i) {
-            let column = column as usize;
-            let entry = momentum.dot(&kinematics.column_twist_w(tree, column));
+        let mut ancestor = i;
+        while ancestor != NO_PARENT && !tree.is_base(ancestor) {
+            let column = tree.joint_dof(ancestor);
+            let entry = momentum.dot(&kinematics.joint_twists_w()[ancestor]);
             mass_matrix[row * dof + column] = entry;
             mass_matrix[column * dof + row] = entry;
+            ancestor = tree.constants()[ancestor].parent;
+        }
+        if tree.is_floating() {
+            for (column, &entry) in momentum.to_vector().iter().enumerate() {
+                mass_matrix[row * dof + column] = entry;
+                mass_matrix[column * dof + row] = entry;
+            }
         }
     }
     if tree.is_floating() {

@@ -53,7 +53,8 @@ impl MassMatrixFactor {
         Self { ancestors, ancestor_starts, lower: vec![0.0; dof * dof], pivots: vec![0.0; dof], base_dof }
     }
 
-    fn ancestors(&self, coordinate: usize) -> &[u32] {
+    #[inline(always)]
+    pub(crate) fn ancestors(&self, coordinate: usize) -> &[u32] {
         &self.ancestors[self.ancestor_starts[coordinate]..self.ancestor_starts[coordinate + 1]]
     }
 
@@ -113,6 +114,12 @@ impl MassMatrixFactor {
             x[k] -= sum;
         }
         Ok(())
+    }
+
+    /// Entry of `L` below the diagonal.
+    #[inline(always)]
+    pub(crate) fn lower(&self, row: usize, column: usize) -> f64 {
+        self.lower[row * self.pivots.len() + column]
     }
 
     /// Diagonal of `D`, all positive; their product is the determinant of `H`.

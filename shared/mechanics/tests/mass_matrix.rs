@@ -7,7 +7,8 @@ use delmpc_mechanics::energy::{generalised_momentum_into, kinetic_energy, total_
 use delmpc_mechanics::errors::{FactorError, ModelError, StepError};
 use delmpc_mechanics::mass_matrix::{MassMatrixWorkspace, mass_matrix_into};
 use delmpc_mechanics::mass_matrix_factor::MassMatrixFactor;
-use delmpc_mechanics::tree::KinematicTree;
+use delmpc_mechanics::spatial::RigidTransform;
+use delmpc_mechanics::tree::{Body, Joint, KinematicTree, LinkInertia, TreeBuilder};
 use nalgebra::{DMatrix, DVector, Vector3};
 use proptest::prelude::*;
 use random_tree::{Random, State, difference, dot, multiply, size};
@@ -136,6 +137,23 @@ fn a_matrix_that_is_not_positive_is_refused_with_the_body() {
     matrix[row * dof + row] = 0.0;
     let error = factor.factorise(&matrix).unwrap_err();
     assert!(matches!(error, StepError::Singular(FactorError::SingularPivot { body: 4, .. })), "{error}");
+}
+
+/// The builder cannot see it (every joint carries mass), the factorisation does.
+#[test]
+fn four_slides_without_mass_between_are_singular() {
+    let mut builder = TreeBuilder::fixed_base(Vector3::zeros());
+    let brick = Random::new(2).inertia();
+    let axes = [Vector3::x(), Vector3::y(), Vector3::z(), Vector3::new(0.6, 0.0, 0.8)];
+    for (i, axis) in axes.into_iter().enumerate() {
+        let inertia = if i == 3 { brick } else { LinkInertia::massless() };
+        let joint = Joint::prismatic(axis, RigidTransform::identity());
+        builder.add(Body::new(i.checked_sub(1), joint, inertia));
+    }
+    let tree = builder.build().unwrap();
+    let matrix = mass_matrix(&tree, &State::random(&mut Random::new(2), &tree)).unwrap();
+    let error = MassMatrixFactor::new(&tree).factorise(&matrix).unwrap_err();
+    assert!(matches!(error, StepError::Singular(FactorError::SingularPivot { body: 0, .. })), "{error}");
 }
 
 #[test]

@@ -87,10 +87,13 @@ impl Random {
                 _ => Some(self.below(body)),
             })
             .collect();
+        let mut massless = vec![false; first + joints];
         for (place, &parent) in parents.iter().enumerate() {
+            // At most two joints between masses: four slides in a row, say, would make the mass matrix singular.
             let has_child = parents.contains(&Some(first + place));
-            let inertia =
-                if has_child && self.below(5) == 0 { LinkInertia::massless() } else { self.inertia() };
+            let between_masses = has_child && !parent.is_some_and(|parent| massless[parent]);
+            massless[first + place] = between_masses && self.below(5) == 0;
+            let inertia = if massless[first + place] { LinkInertia::massless() } else { self.inertia() };
             let mut body = Body::new(parent, self.joint(), inertia);
             body.drag.fill(self.range(0.0, 1.0));
             builder.add(body);

@@ -1,0 +1,647 @@
+//! Discrete linearisation `δx_{k+1} = A δx_k + B δu` of one solved step.
+//!
+//! | letter | meaning |
+//! |---|---|
+//! | `H[α,γ]` | derivative of row α by node γ, [`crate::del_hessian`]; `J` its part `α < s`, `γ >= 1` |
+//! | `Z^γ` | derivative of node γ by what the column varies |
+//! | `e_0` | selects the rows α = 0 |
+//! | `T` | change of coordinates `(q, q̇) → (q, p)` |
+//!
+//! ```text
+//! J Z_q = -H[:,0]      J Z_p = -e_0 ⊗ 1      J Z_u^α = -w_α Δt (e_α ⊗ 1)  (α < s),  Z_u^s = 0
+//! A = [ Z_q^(s)                         Z_p^(s)             ]    B^α = [ Z_u^{α,(s)}                                 ]
+//!     [ H[s,0] + Σ_γ H[s,γ] Z_q^(γ)     Σ_γ H[s,γ] Z_p^(γ)  ]          [ Σ_γ H[s,γ] Z_u^{α,(γ)} + δ_{αs} w_s Δt 1    ]
+//! ```
+//!
+//! A held input has `B = Σ_α B^α`. Without dissipation `AᵀΩA = Ω`, `Ω = [0 1; -1 0]`.
+//!
+//! **(q, q̇).** At step boundaries `p = M(q) q̇`, so `δp = K_q̇q δq + M δq̇` and `A' = T_{k+1}⁻¹ A T_k`, `B' = T_{k+1}⁻¹ B` with
+//! `T = [1 0; K_q̇q M]`. The change of coordinates is folded into the right-hand sides and the last row.
+//!
+//! **Two paths.** The matrix path solves all columns at once with the Hessian blocks, O(n Σ depth): fastest up to about
+//! n = 60. The strict O(n²) path takes one Algorithm T, one solve and one Algorithm T per column
+//! ([`Linearizer::linearize_by_tangent`]); it also serves the floating base.
+//!
+//! **Floating base.** Coordinates are minimal and canonical: `x = (ε, δq, δπ, δp_j)` with the pose error `δg = g ε^` and
+//! `δπ = Ad_gᵀ(δP + ½ ad^D_P η)`; the ½-term makes the symplectic form constant, so again `AᵀΩA = Ω`.
+//!
+//! Source: the paper, section 3.4 (its O(n²) is the cost of the Hessian; A and B need the solves as well).
+
+use alloc::vec;
+use alloc::vec::Vec;
+
+use crate::del_hessian::DelHessian;
+use crate::del_residual::DelWorkspace;
+use crate::errors::{ModelError, StepError};
+use crate::kinetic_hessian::KineticHessian;
+use crate::lanes::{Kernel, Lane, Quad, Simd};
+use crate::mass_matrix_factor::MassMatrixFactor;
+use crate::newton_direction::{NewtonDirection, NewtonSolver};
+use crate::row_matrix::RowMatrix;
+use crate::spatial::{RigidTransform, Twist, Wrench};
+use crate::step::Integrator;
+use crate::tangent::{StartVariation, TangentWorkspace};
+use crate::tree::KinematicTree;
+
+/// State of the linearised dynamics.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum StateCoordinates {
+    /// `(q, p)`; a floating base: `(ε, δq, δπ, δp_j)`.
+    Momentum,
+    /// `(q, q̇)`; fixed base.
+    Velocity,
+}
+
+/// Input of the linearised dynamics.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum InputHold {
+    /// One joint force per joint, held over the step.
+    Held,
+    /// One per joint and node, node-major: `s + 1` blocks of columns.
+    PerNode,
+}
+
+/// `[A | B]` of one step, `2n x (2n + m)`.
+#[derive(Clone, Debug)]
+pub struct LinearStep {
+    n: usize,
+    matrix: RowMatrix,
+}
+
+impl LinearStep {
+    /// Number of coordinates `n` (half the states).
+    pub fn dof(&self) -> usize {
+        self.n
+    }
+
+    /// Number of inputs `m`.
+    pub fn inputs(&self) -> usize {
+        self.matrix.columns() - 2 * self.n
+    }
+
+    /// Entry of `A`.
+    #[inline(always)]
+    pub fn a(&self, row: usize, column: usize) -> f64 {
+        self.matrix.get(row, column)
+    }
+
+    /// Entry of `B`.
+    #[inline(always)]
+    pub fn b(&self, row: usize, column: usize) -> f64 {
+        self.matrix.get(row, 2 * self.n + column)
+    }
+
+    /// `[A | B]`.
+    pub fn matrix(&self) -> &RowMatrix {
+        &self.matrix
+    }
+}
+
+/// Workspace of the linearisation for one tree, rule, choice of coordinates and input.
+#[derive(Clone, Debug)]
+pub struct Linearizer {
+    coordinates: StateCoordinates,
+    hold: InputHold,
+    s: usize,
+    /// Right-hand sides, then `Z`: coordinate-major rows.
+    z: RowMatrix,
+    step: LinearStep,
+    /// Where the solver keeps none (Algorithm B.1).
+    hessian: DelHessian,
+    kinetic: Option<KineticHessian>,
+    mass_matrix: Vec<f64>,
+    factor: MassMatrixFactor,
+    velocities: [Vec<f64>; 2],
+    tangent: TangentWorkspace,
+    column: Vec<f64>,
+    momentum: Vec<f64>,
+}
+
+impl Linearizer {
+    /// For the steps of `integrator`.
+    ///
+    /// # Errors
+    /// [`ModelError::Unsupported`] for velocity coordinates of a floating base.
+    pub fn new(
+        tree: &KinematicTree,
+        integrator: &Integrator,
+        coordinates: StateCoordinates,
+        hold: InputHold,
+    ) -> Result<Self, ModelError> {
+        let del = integrator.del();
+        let (n, s) = (tree.dof(), del.unknown_nodes());
+        let inputs = match hold {
+            InputHold::Held => tree.joint_count(),
+            InputHold::PerNode => tree.joint_count() * (s + 1),
+        };
+        let velocity = coordinates == StateCoordinates::Velocity;
+        Ok(Self {
+            coordinates,
+            hold,
+            s,
+            z: RowMatrix::zeros(s * n, 2 * n + inputs),
+            step: LinearStep { n, matrix: RowMatrix::zeros(2 * n, 2 * n + inputs) },
+            hessian: DelHessian::new(tree, del),
+            kinetic: if velocity { Some(KineticHessian::new(tree)?) } else { None },
+            mass_matrix: vec![0.0; if velocity { n * n } else { 0 }],
+            factor: MassMatrixFactor::new(tree),
+            velocities: [vec![0.0; n], vec![0.0; n]],
+            tangent: TangentWorkspace::new(tree, del),
+            column: vec![0.0; s * n],
+            momentum: vec![0.0; n],
+        })
+    }
+
+    /// `A` and `B` around the step that `integrator` has just solved ([`Integrator::solve`] or [`Integrator::step`]).
+    /// Factorises the Newton matrix at the solution. No allocation. Fixed base: O(n Σ depth); floating base: the O(n²) path.
+    ///
+    /// # Errors
+    /// [`StepError::Singular`] when a factorisation fails.
+    pub fn linearize(
+        &mut self,
+        tree: &KinematicTree,
+        integrator: &mut Integrator,
+    ) -> Result<&LinearStep, StepError> {
+        if tree.is_floating() {
+            return self.linearize_by_tangent(tree, integrator);
+        }
+        if self.coordinates == StateCoordinates::Velocity {
+            self.evaluate_velocities(tree, integrator)?;
+        }
+        let (del, solver) = integrator.del_and_solver();
+        solver.factor(tree, del)?;
+        if solver.hessian().is_none() {
+            self.hessian.evaluate(tree, del);
+        }
+        fill_right_hand_sides(
+            tree,
+            del,
+            solver.hessian().unwrap_or(&self.hessian),
+            self.hold,
+            self.kinetic.as_ref(),
+            &mut self.z,
+        );
+        solver.solve_many(tree, &mut self.z);
+        let hessian = solver.hessian().unwrap_or(&self.hessian);
+        del.instructions.dispatch(EndRows {
+            tree,
+            hessian,
+            kinetic: self.kinetic.as_ref(),
+            z: &self.z,
+            out: &mut self.step.matrix,
+            s: self.s,
+        });
+        self.add_direct_terms(tree, del, solver);
+        if self.kinetic.is_some() {
+            del.instructions.dispatch(SolveMass { factor: &self.factor, out: &mut self.step.matrix });
+        }
+        Ok(&self.step)
+    }
+
+    /// The linear step last computed.
+    pub fn linear_step(&self) -> &LinearStep {
+        &self.step
+    }
+
+    /// Velocities `M⁻¹p` at both ends, the kinetic Hessians there, and the factor of the mass matrix at the end.
+    fn evaluate_velocities(
+        &mut self,
+        tree: &KinematicTree,
+        integrator: &mut Integrator,
+    ) -> Result<(), StepError> {
+        let Some(kinetic) = &mut self.kinetic else { return Ok(()) };
+        let n = tree.dof();
+        let start = &integrator.del().start;
+        let end = integrator.next_state();
+        // The mass matrix does not depend on the rates: one pass gives it at both ends, a second one the Hessians.
+        let [rate_start, rate_end] = &mut self.velocities;
+        kinetic.evaluate(tree, &[(&start.q, &start.p), (&end.q, &end.p)])?;
+        for (state, (momentum, rate)) in
+            [(&start.p, &mut *rate_start), (&end.p, &mut *rate_end)].into_iter().enumerate()
+        {
+            for i in 0..n {
+                for (position, &j) in tree.branch(i).iter().enumerate() {
+                    self.mass_matrix[i * n + j as usize] = kinetic.pair(i, position)[0].0[state];
+                }
+            }
+            self.factor.factorise(&self.mass_matrix)?;
+            rate.copy_from_slice(momentum);
+            self.factor.solve_in_place(rate)?;
+        }
+        kinetic.evaluate(tree, &[(&start.q, rate_start), (&end.q, rate_end)])?;
+        Ok(())
+    }
+
+    /// `H[s,0]` in the columns of `q` and `w_s Δt` in those of the input at node s.
+    fn add_direct_terms(&mut self, tree: &KinematicTree, del: &DelWorkspace, solver: &NewtonSolver) {
+        let hessian = solver.hessian().unwrap_or(&self.hessian);
+        let (n, s) = (tree.dof(), self.s);
+        let out = &mut self.step.matrix;
+        for i in 0..n {
+            for (position, &j) in tree.branch(i).iter().enumerate() {
+                let (j, pair) = (j as usize, hessian.pair_starts[i] + position);
+                out.add(n + i, j, hessian.entry(pair, s, 0));
+                if i != j {
+                    out.add(n + j, i, hessian.mirrored(pair, s, 0));
+                }
+            }
+            let last = match self.hold {
+                InputHold::Held => 2 * n + i,
+                InputHold::PerNode => 2 * n + s * n + i,
+            };
+            out.add(n + i, last, del.rule.weights()[s] * del.time_step);
+        }
+    }
+
+    /// The strict O(n²) path: per column one Algorithm T, one solve, one Algorithm T. Fixed base in `(q, p)`, floating base in
+    /// `(ε, δq, δπ, δp_j)`.
+    ///
+    /// # Errors
+    /// [`StepError::Singular`] when the factorisation fails; [`ModelError::Unsupported`] for velocity coordinates.
+    pub fn linearize_by_tangent(
+        &mut self,
+        tree: &KinematicTree,
+        integrator: &mut Integrator,
+    ) -> Result<&LinearStep, StepError> {
+        if self.coordinates == StateCoordinates::Velocity {
+            let reason = "the tangent path gives momentum coordinates";
+            return Err(ModelError::Unsupported { body: 0, reason }.into());
+        }
+        let (del, solver) = integrator.del_and_solver();
+        solver.factor(tree, del)?;
+        let n = tree.dof();
+        for column in 0..self.step.matrix.columns() {
+            self.tangent_column(tree, del, solver, column, n);
+        }
+        Ok(&self.step)
+    }
+
+    fn tangent_column(
+        &mut self,
+        tree: &KinematicTree,
+        del: &DelWorkspace,
+        solver: &mut NewtonSolver,
+        column: usize,
+        n: usize,
+    ) {
+        let (s, base) = (self.s, tree.base_dof());
+        let start_pose = del.start.base_pose;
+        self.tangent.clear();
+        let mut start = StartVariation::default();
+        if column < base {
+            start.base_twist_w = start_pose.transform_twist(&unit_twist(column));
+            let momentum = del.start_momentum();
+            start.base_momentum_w = momentum.dual_bracket(&start.base_twist_w) * -0.5;
+        } else if column < n {
+            self.tangent.set(0, column, 1.0);
+        } else if column < n + base {
+            start.base_momentum_w = start_pose.transform_wrench(&unit_wrench(column - n));
+        }
+        self.tangent.set_start(start);
+        self.tangent.evaluate(tree, del);
+        self.tangent.residual_into(tree, del, &mut self.column);
+        if (n + base..2 * n).contains(&column) {
+            self.column[(column - n) * s] += 1.0;
+        }
+        let joints = tree.joint_count();
+        let input = (column >= 2 * n).then(|| {
+            let index = column - 2 * n;
+            (index % joints + base, index / joints)
+        });
+        let step = |alpha: usize| del.rule.weights()[alpha] * del.time_step;
+        if let Some((dof, node)) = input {
+            for alpha in 0..s {
+                if self.hold == InputHold::Held || alpha == node {
+                    self.column[dof * s + alpha] += step(alpha);
+                }
+            }
+        }
+        for x in &mut self.column {
+            *x = -*x;
+        }
+        solver.solve(tree, &mut self.column);
+        for dof in 0..n {
+            for gamma in 1..=s {
+                self.tangent.set(gamma, dof, self.column[dof * s + gamma - 1]);
+            }
+        }
+        self.tangent.evaluate(tree, del);
+        self.tangent.next_momentum_into(tree, del, &mut self.momentum);
+        if let Some((dof, node)) = input {
+            if self.hold == InputHold::Held || node == s {
+                self.momentum[dof] += step(s);
+            }
+        }
+        self.write_column(tree, del, column, n);
+    }
+
+    fn write_column(&mut self, tree: &KinematicTree, del: &DelWorkspace, column: usize, n: usize) {
+        let (s, base) = (self.s, tree.base_dof());
+        let out = &mut self.step.matrix;
+        if base > 0 {
+            let end_pose: RigidTransform = del.body_pose(0, s);
+            let eta = self.tangent.body_variation(0, s);
+            let change = Wrench::from_vector(&nalgebra::Vector6::from_column_slice(&self.momentum[..6]));
+            let (_, impulse) = del.body_momentum_and_impulse(0, s);
+            let momentum = del.base_momentum_before_end() + impulse;
+            let pose_error = end_pose.inverse_transform_twist(&eta).to_vector();
+            let momentum_error =
+                end_pose.inverse_transform_wrench(&(change + momentum.dual_bracket(&eta) * 0.5)).to_vector();
+            for k in 0..6 {
+                out.set(k, column, pose_error[k]);
+                out.set(n + k, column, momentum_error[k]);
+            }
+        }
+        for dof in base..n {
+            out.set(dof, column, self.column[dof * s + s - 1]);
+            out.set(n + dof, column, self.momentum[dof]);
+        }
+    }
+
+    /// Adjoint products `Aᵀλ` (2n) and `Bᵀλ` (inputs) in `(q, p)` around the step that `integrator` has just solved, by one
+    /// transposed solve: O(s² Σ depth) with a factorised Newton matrix. Fixed base. Use it for gradients instead of `A`, `B`.
+    ///
+    /// # Errors
+    /// [`StepError::Singular`] when the factorisation fails; [`ModelError`] for a floating base, velocity coordinates or wrong
+    /// lengths.
+    pub fn adjoint_into(
+        &mut self,
+        tree: &KinematicTree,
+        integrator: &mut Integrator,
+        lambda: &[f64],
+        a_lambda: &mut [f64],
+        b_lambda: &mut [f64],
+    ) -> Result<(), StepError> {
+        let (n, s) = (tree.dof(), self.s);
+        if tree.is_floating() || self.coordinates == StateCoordinates::Velocity {
+            let reason = "adjoint products are in (q, p) of a fixed base";
+            return Err(ModelError::Unsupported { body: 0, reason }.into());
+        }
+        for (quantity, got, expected) in [
+            ("lambda", lambda.len(), 2 * n),
+            ("a_lambda", a_lambda.len(), 2 * n),
+            ("b_lambda", b_lambda.len(), self.step.inputs()),
+        ] {
+            if got != expected {
+                return Err(ModelError::Length { quantity, got, expected }.into());
+            }
+        }
+        let (del, solver) = integrator.del_and_solver();
+        solver.factor(tree, del)?;
+        if solver.hessian().is_none() {
+            self.hessian.evaluate(tree, del);
+        }
+        let (lambda_q, lambda_p) = lambda.split_at(n);
+        let y = &mut self.column;
+        y.fill(0.0);
+        a_lambda.fill(0.0);
+        {
+            let hessian = solver.hessian().unwrap_or(&self.hessian);
+            for i in 0..n {
+                y[i * s + s - 1] += lambda_q[i];
+                for (position, &j) in tree.branch(i).iter().enumerate() {
+                    let (j, pair) = (j as usize, hessian.pair_starts[i] + position);
+                    for gamma in 1..=s {
+                        y[j * s + gamma - 1] += hessian.entry(pair, s, gamma) * lambda_p[i];
+                        if i != j {
+                            y[i * s + gamma - 1] += hessian.mirrored(pair, s, gamma) * lambda_p[j];
+                        }
+                    }
+                    a_lambda[j] += hessian.entry(pair, s, 0) * lambda_p[i];
+                    if i != j {
+                        a_lambda[i] += hessian.mirrored(pair, s, 0) * lambda_p[j];
+                    }
+                }
+            }
+        }
+        solver.solve_transposed(tree, y);
+        let hessian = solver.hessian().unwrap_or(&self.hessian);
+        let step = |alpha: usize| del.rule.weights()[alpha] * del.time_step;
+        b_lambda.fill(0.0);
+        for i in 0..n {
+            a_lambda[n + i] = -y[i * s];
+            for alpha in 0..=s {
+                let slot = match self.hold {
+                    InputHold::Held => i,
+                    InputHold::PerNode => alpha * n + i,
+                };
+                b_lambda[slot] += step(alpha) * if alpha < s { -y[i * s + alpha] } else { lambda_p[i] };
+            }
+            for (position, &j) in tree.branch(i).iter().enumerate() {
+                let (j, pair) = (j as usize, hessian.pair_starts[i] + position);
+                for alpha in 0..s {
+                    a_lambda[j] -= hessian.entry(pair, alpha, 0) * y[i * s + alpha];
+                    if i != j {
+                        a_lambda[i] -= hessian.mirrored(pair, alpha, 0) * y[j * s + alpha];
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+fn unit_twist(k: usize) -> Twist {
+    Twist::from_vector(&nalgebra::Vector6::ith(k, 1.0))
+}
+
+fn unit_wrench(k: usize) -> Wrench {
+    Wrench::from_vector(&nalgebra::Vector6::ith(k, 1.0))
+}
+
+fn fill_right_hand_sides(
+    tree: &KinematicTree,
+    del: &DelWorkspace,
+    hessian: &DelHessian,
+    hold: InputHold,
+    kinetic: Option<&KineticHessian>,
+    z: &mut RowMatrix,
+) {
+    let (n, s) = (tree.dof(), del.unknown_nodes());
+    z.clear();
+    for i in 0..n {
+        for (position, &j) in tree.branch(i).iter().enumerate() {
+            let (j, pair) = (j as usize, hessian.pair_starts[i] + position);
+            for alpha in 0..s {
+                z.set(i * s + alpha, j, -hessian.entry(pair, alpha, 0));
+                if i != j {
+                    z.set(j * s + alpha, i, -hessian.mirrored(pair, alpha, 0));
+                }
+            }
+            if let Some(kinetic) = kinetic {
+                let [mass, own_rate, other_rate, _] = kinetic.pair(i, position).map(|q| q.0[0]);
+                z.add(i * s, j, -own_rate);
+                z.set(i * s, n + j, -mass);
+                if i != j {
+                    z.add(j * s, i, -other_rate);
+                    z.set(j * s, n + i, -mass);
+                }
+            }
+        }
+        if kinetic.is_none() {
+            z.set(i * s, n + i, -1.0);
+        }
+        for alpha in 0..s {
+            let column = match hold {
+                InputHold::Held => 2 * n + i,
+                InputHold::PerNode => 2 * n + alpha * n + i,
+            };
+            z.set(i * s + alpha, column, -del.rule.weights()[alpha] * del.time_step);
+        }
+    }
+}
+
+/// Quads of columns carried in registers.
+const CHUNK: usize = 2;
+
+/// Rows of `q_{k+1}` (copied) and of `p_{k+1}`: `Σ_γ H[s,γ] Z^γ`, minus `K_q̇q Z^s` in velocity coordinates.
+struct EndRows<'a> {
+    tree: &'a KinematicTree,
+    hessian: &'a DelHessian,
+    kinetic: Option<&'a KineticHessian>,
+    z: &'a RowMatrix,
+    out: &'a mut RowMatrix,
+    s: usize,
+}
+
+impl Kernel for EndRows<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let stride = self.z.stride();
+        let (tree, hessian, kinetic) = (self.tree, self.hessian, self.kinetic);
+        let (z, out) = (self.z.quads(), self.out.quads_mut());
+        let mut at = 0;
+        while at < stride {
+            match (self.s, stride - at) {
+                (1, CHUNK..) => end_chunk::<S, CHUNK>(simd, tree, hessian, kinetic, z, out, stride, at, 1),
+                (2, CHUNK..) => end_chunk::<S, CHUNK>(simd, tree, hessian, kinetic, z, out, stride, at, 2),
+                (s, CHUNK..) => end_chunk::<S, CHUNK>(simd, tree, hessian, kinetic, z, out, stride, at, s),
+                (s, _) => end_chunk::<S, 1>(simd, tree, hessian, kinetic, z, out, stride, at, s),
+            }
+            at += if stride - at >= CHUNK { CHUNK } else { 1 };
+        }
+    }
+}
+
+#[inline(always)]
+#[allow(clippy::too_many_arguments)]
+fn end_chunk<S: Simd, const W: usize>(
+    simd: S,
+    tree: &KinematicTree,
+    hessian: &DelHessian,
+    kinetic: Option<&KineticHessian>,
+    z: &[Quad],
+    out: &mut [Quad],
+    stride: usize,
+    at: usize,
+    s: usize,
+) {
+    let n = tree.dof();
+    for i in 0..n {
+        for w in 0..W {
+            out[i * stride + at + w] = z[(i * s + s - 1) * stride + at + w];
+            out[(n + i) * stride + at + w] = Quad::ZERO;
+        }
+    }
+    for i in 0..n {
+        let branch = tree.branch(i);
+        let first = hessian.pair_starts[i];
+        let mut sum: [Lane<S>; W] = [Lane::splat(simd, 0.0); W];
+        for (position, &j) in branch.iter().enumerate() {
+            let j = j as usize;
+            let pair = first + position;
+            let (mut own_rate, mut other_rate) = (0.0, 0.0);
+            if let Some(kinetic) = kinetic {
+                let terms = kinetic.pair(i, position);
+                (own_rate, other_rate) = (terms[1].0[1], terms[2].0[1]);
+            }
+            for gamma in 1..=s {
+                let mut ahead = hessian.entry(pair, s, gamma);
+                let mut behind = hessian.mirrored(pair, s, gamma);
+                if gamma == s {
+                    ahead -= own_rate;
+                    behind -= other_rate;
+                }
+                let ahead = Lane::splat(simd, ahead);
+                let from = &z[(j * s + gamma - 1) * stride + at..][..W];
+                for w in 0..W {
+                    sum[w] = ahead.mul_add(Lane::load(simd, &from[w]), sum[w]);
+                }
+                if i != j {
+                    let behind = Lane::splat(simd, behind);
+                    let own = &z[(i * s + gamma - 1) * stride + at..][..W];
+                    let target = &mut out[(n + j) * stride + at..][..W];
+                    for w in 0..W {
+                        let moved = behind.mul_add(Lane::load(simd, &own[w]), Lane::load(simd, &target[w]));
+                        target[w] = moved.quad();
+                    }
+                }
+            }
+        }
+        let target = &mut out[(n + i) * stride + at..][..W];
+        for w in 0..W {
+            target[w] = (Lane::load(simd, &target[w]) + sum[w]).quad();
+        }
+    }
+}
+
+/// Rows of `p` to rows of `q̇`: the branch-sparse factor of the mass matrix on all columns at once.
+struct SolveMass<'a> {
+    factor: &'a MassMatrixFactor,
+    out: &'a mut RowMatrix,
+}
+
+impl Kernel for SolveMass<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let stride = self.out.stride();
+        let mut at = 0;
+        while at < stride {
+            if stride - at >= CHUNK {
+                mass_chunk::<S, CHUNK>(simd, self.factor, self.out.quads_mut(), stride, at);
+                at += CHUNK;
+            } else {
+                mass_chunk::<S, 1>(simd, self.factor, self.out.quads_mut(), stride, at);
+                at += 1;
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn mass_chunk<S: Simd, const W: usize>(
+    simd: S,
+    factor: &MassMatrixFactor,
+    out: &mut [Quad],
+    stride: usize,
+    at: usize,
+) {
+    let n = factor.pivots().len();
+    for k in (0..n).rev() {
+        let own: [Lane<S>; W] = core::array::from_fn(|w| Lane::load(simd, &out[(n + k) * stride + at + w]));
+        for &j in factor.ancestors(k) {
+            let l = Lane::splat(simd, factor.lower(k, j as usize));
+            let target = &mut out[(n + j as usize) * stride + at..][..W];
+            for w in 0..W {
+                target[w] = l.neg_mul_add(own[w], Lane::load(simd, &target[w])).quad();
+            }
+        }
+    }
+    for k in 0..n {
+        let scale = Lane::splat(simd, 1.0 / factor.pivots()[k]);
+        let mut own: [Lane<S>; W] =
+            core::array::from_fn(|w| scale * Lane::load(simd, &out[(n + k) * stride + at + w]));
+        for &j in factor.ancestors(k) {
+            let l = Lane::splat(simd, factor.lower(k, j as usize));
+            let from = &out[(n + j as usize) * stride + at..][..W];
+            for w in 0..W {
+                own[w] = l.neg_mul_add(Lane::load(simd, &from[w]), own[w]);
+            }
+        }
+        for w in 0..W {
+            out[(n + k) * stride + at + w] = own[w].quad();
+        }
+    }
+}
