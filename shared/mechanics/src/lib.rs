@@ -18,6 +18,7 @@ pub mod kinematics;
 pub mod kinetic_hessian;
 pub(crate) mod lanes;
 pub mod linearize;
+pub mod load_response;
 pub mod lobatto;
 pub mod mass_matrix;
 pub mod mass_matrix_factor;

@@ -61,7 +61,7 @@ impl NewtonMethod {
     /// The faster one for a tree and a number of unknown nodes, by measured crossover of the depth.
     pub fn fastest(tree: &KinematicTree, unknown_nodes: usize) -> Self {
         let bodies = tree.first_joint_body()..tree.body_count();
-        let sum: f64 = bodies.map(|i| (tree.branch(i).len() as f64).powi(2)).sum();
+        let sum: f64 = bodies.map(|i| (tree.branch(i).len() * tree.branch(i).len()) as f64).sum();
         let limit = CROSSOVER_DEPTH[unknown_nodes.clamp(1, CROSSOVER_DEPTH.len()) - 1];
         if sum > limit * limit * tree.joint_count().max(1) as f64 { Self::Recursive } else { Self::BranchLu }
     }

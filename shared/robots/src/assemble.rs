@@ -1,0 +1,466 @@
+//! From the description to the tree: groups of fixed links become bodies, joints become coordinates.
+//!
+//! ```text
+//! link pose in its body:  X_link = X_parent_link · origin(fixed joint)
+//! body inertia:           Σ over its links, moved to the body's link frame
+//! planar joint:           slide(e1) · slide(e2) · turn(n), massless bodies between
+//! ```
+//!
+//! Planar joints with the normal along a coordinate axis slide along the other two (normal y: x, then z) and their coordinates
+//! are called `joint_x`, `joint_z`, `joint_pitch`; for any other normal they are `joint_1`, `joint_2`, `joint_angle`.
+
+use std::path::Path;
+
+use delmpc_mechanics::errors::ModelError;
+use delmpc_mechanics::spatial::{RigidTransform, SpatialInertia};
+use delmpc_mechanics::tree::{Body, Joint, KinematicTree, LinkInertia, TreeBuilder};
+use nalgebra::Vector3;
+use urdf_rs::JointType;
+
+use crate::companion::CompanionFile;
+use crate::error::{RobotError, Rule, Subject};
+use crate::inertia;
+use crate::limits::MAX_COORDINATES;
+use crate::load::{BaseChoice, ImpossibleInertia, LoadOptions};
+use crate::mimic::{CoordinateMap, Follower};
+use crate::model::{Attachment, JointLimits, NamedLink, RobotModel, Shape};
+use crate::urdf::{Description, Joint as UrdfJoint};
+
+/// A body in the making. Group 0 is the root link with all that is fixed to it.
+struct Group {
+    parent: usize,
+    joint: Joint,
+    name: String,
+    coordinate: Option<Coordinate>,
+    /// First link of the group; `None` for the massless bodies inside a planar joint.
+    link: Option<usize>,
+    inertia: SpatialInertia,
+    /// Kept as given when the group is one link with its frame at the body's.
+    single: Option<LinkInertia>,
+    has_inertial: bool,
+}
+
+struct Coordinate {
+    name: String,
+    joint: usize,
+    limits: JointLimits,
+    actuated: bool,
+}
+
+struct Assembly<'a> {
+    file: &'a Path,
+    description: &'a Description,
+    options: &'a LoadOptions,
+    groups: Vec<Group>,
+    /// Group and pose of every link.
+    placed: Vec<Option<(usize, RigidTransform)>>,
+    warnings: Vec<String>,
+}
+
+/// Builds the model.
+pub(crate) fn assemble(
+    file: &Path,
+    description: &Description,
+    companion: Option<&CompanionFile>,
+    options: &LoadOptions,
+) -> Result<RobotModel, RobotError> {
+    let mut assembly = Assembly {
+        file,
+        description,
+        options,
+        groups: Vec::new(),
+        placed: vec![None; description.links.len()],
+        warnings: description.warnings.clone(),
+    };
+    let floating_from_world = assembly.collect()?;
+    let massive_root = assembly.groups[0].inertia.mass > 0.0;
+    let refuse_base = |wanted: String| Err(assembly.refuse_file(Rule::Base { wanted }));
+    match &options.base {
+        BaseChoice::Auto => assembly.finish(companion, massive_root || floating_from_world, None),
+        BaseChoice::Floating if massive_root || floating_from_world => assembly.finish(companion, true, None),
+        BaseChoice::Floating => refuse_base("floating: its root link has no mass".to_owned()),
+        BaseChoice::Fixed(name) => {
+            let link = description.links.iter().position(|link| link.name == *name);
+            let Some((group, pose)) = link.and_then(|link| assembly.placed[link]) else {
+                return refuse_base(format!("fixed at `{name}`: there is no such link"));
+            };
+            if group == 0 {
+                assembly.finish(companion, false, Some(pose))
+            } else if massive_root || floating_from_world {
+                Ok(assembly.finish(companion, true, None)?.rooted_at(name)?.model)
+            } else {
+                refuse_base(format!(
+                    "fixed at `{name}`: the root link is empty, so the robot is fixed there already"
+                ))
+            }
+        }
+    }
+}
+
+impl Assembly<'_> {
+    fn refuse_file(&self, rule: Rule) -> RobotError {
+        RobotError::new(self.file, None, Subject::File, rule)
+    }
+
+    fn refuse_joint(&self, joint: &UrdfJoint, rule: Rule) -> RobotError {
+        RobotError::new(self.file, Some(joint.line), Subject::Joint(joint.name.clone()), rule)
+    }
+
+    fn refuse_link(&self, link: usize, rule: Rule) -> RobotError {
+        let link = &self.description.links[link];
+        RobotError::new(self.file, Some(link.line), Subject::Link(link.name.clone()), rule)
+    }
+
+    /// Walks the tree depth-first and fills `groups` and `placed`. Returns whether an empty root carries a floating robot.
+    fn collect(&mut self) -> Result<bool, RobotError> {
+        let description = self.description;
+        let root = description.root;
+        let mut start = root;
+        if let ([joint], None) = (&description.children[root][..], &description.links[root].inertia) {
+            let joint = &description.joints[*joint];
+            if joint.kind == JointType::Floating {
+                start = joint.child;
+            }
+        }
+        self.groups.push(Group {
+            parent: 0,
+            joint: Joint::revolute(Vector3::x(), RigidTransform::identity()),
+            name: description.links[start].name.clone(),
+            coordinate: None,
+            link: Some(start),
+            inertia: SpatialInertia::default(),
+            single: None,
+            has_inertial: false,
+        });
+        self.place(start, 0, RigidTransform::identity())?;
+        let mut open: Vec<usize> = description.children[start].iter().rev().copied().collect();
+        while let Some(index) = open.pop() {
+            let joint = &description.joints[index];
+            let Some((group, pose)) = self.placed[joint.parent] else { continue };
+            let placement = pose * joint.origin;
+            match joint.kind {
+                JointType::Fixed => self.place(joint.child, group, placement)?,
+                _ => {
+                    let group = self.add_joint(index, group, placement)?;
+                    self.place(joint.child, group, RigidTransform::identity())?;
+                }
+            }
+            open.extend(description.children[joint.child].iter().rev());
+        }
+        for group in &self.groups[1..] {
+            if let (Some(link), false) = (group.link, group.has_inertial) {
+                return Err(self.refuse_link(link, Rule::MissingInertial));
+            }
+        }
+        Ok(start != root)
+    }
+
+    /// Puts a link into a group, with its inertia.
+    fn place(&mut self, link: usize, group: usize, pose: RigidTransform) -> Result<(), RobotError> {
+        self.placed[link] = Some((group, pose));
+        let Some(mut given) = self.description.links[link].inertia else { return Ok(()) };
+        if let Err(error) = inertia::check(&given) {
+            let repairable = matches!(
+                error,
+                ModelError::InertiaNotPositive { .. }
+                    | ModelError::InertiaTriangle { .. }
+                    | ModelError::InertiaWithoutMass { .. }
+            );
+            if !repairable || self.options.impossible_inertia == ImpossibleInertia::Refuse {
+                return Err(self.refuse_link(link, Rule::Physics(error)));
+            }
+            given = inertia::repair(&given);
+            let warning = format!(
+                "{}. The nearest possible inertia is used",
+                self.refuse_link(link, Rule::Physics(error))
+            );
+            self.warnings.push(warning.replace(" Remedy:", ""));
+        }
+        let group = &mut self.groups[group];
+        let alone = !group.has_inertial && pose == RigidTransform::identity();
+        group.single = alone.then_some(given);
+        group.has_inertial = true;
+        group.inertia += given.spatial().transformed(&pose);
+        Ok(())
+    }
+
+    /// Adds the bodies of a moving joint; returns the group its child link belongs to.
+    fn add_joint(
+        &mut self,
+        index: usize,
+        parent: usize,
+        placement: RigidTransform,
+    ) -> Result<usize, RobotError> {
+        let joint = &self.description.joints[index];
+        let child = &self.description.links[joint.child].name;
+        let unsupported = |kind| Err(self.refuse_joint(joint, Rule::UnsupportedJoint { kind }));
+        let steps: Vec<(Joint, String)> = match joint.kind {
+            JointType::Revolute | JointType::Continuous => {
+                vec![(Joint::revolute(joint.axis, placement), joint.name.clone())]
+            }
+            JointType::Prismatic => vec![(Joint::prismatic(joint.axis, placement), joint.name.clone())],
+            JointType::Planar if joint.mimic.is_some() => return unsupported("mimicking planar"),
+            JointType::Planar => {
+                let ([first, second], names) = plane(&joint.axis);
+                let [first_name, second_name, angle] = names.map(|name| format!("{}_{name}", joint.name));
+                let here = RigidTransform::identity();
+                vec![
+                    (Joint::prismatic(first, placement), first_name),
+                    (Joint::prismatic(second, here), second_name),
+                    (Joint::revolute(joint.axis, here), angle),
+                ]
+            }
+            JointType::Floating => return unsupported("floating"),
+            JointType::Spherical => return unsupported("spherical"),
+            JointType::Fixed => return unsupported("fixed"),
+        };
+        let last = steps.len() - 1;
+        let mut parent = parent;
+        for (step, (kinematics, name)) in steps.into_iter().enumerate() {
+            if self.groups.len() > MAX_COORDINATES {
+                let rule = Rule::TooMany { what: "joint coordinates", limit: MAX_COORDINATES };
+                return Err(self.refuse_joint(joint, rule));
+            }
+            self.groups.push(Group {
+                parent,
+                joint: kinematics.with_damping(joint.damping),
+                name: if step == last { child.clone() } else { name.clone() },
+                coordinate: Some(Coordinate {
+                    name,
+                    joint: index,
+                    limits: joint.limits,
+                    actuated: joint.kind != JointType::Planar && joint.mimic.is_none(),
+                }),
+                link: (step == last).then_some(joint.child),
+                inertia: SpatialInertia::default(),
+                single: None,
+                has_inertial: false,
+            });
+            parent = self.groups.len() - 1;
+        }
+        Ok(parent)
+    }
+
+    /// Builds tree and model; `fixed_frame` is the pose of the fixed link's frame in the root group.
+    fn finish(
+        mut self,
+        companion: Option<&CompanionFile>,
+        floating: bool,
+        fixed_frame: Option<RigidTransform>,
+    ) -> Result<RobotModel, RobotError> {
+        let coordinates = || self.groups.iter().filter_map(|group| group.coordinate.as_ref());
+        let joint_names: Vec<String> = coordinates().map(|coordinate| coordinate.name.clone()).collect();
+        let (passive, springs) = match companion {
+            Some(companion) => companion.joints(&joint_names)?,
+            None => (vec![false; joint_names.len()], joint_names.iter().map(|_| None).collect()),
+        };
+        self.check_names(&joint_names)?;
+        let limits: Vec<JointLimits> = coordinates().map(|coordinate| coordinate.limits).collect();
+        let of_joint = |value: fn(&UrdfJoint) -> f64| -> Vec<f64> {
+            coordinates().map(|coordinate| value(&self.description.joints[coordinate.joint])).collect()
+        };
+        let (damping, friction) = (of_joint(|joint| joint.damping), of_joint(|joint| joint.friction));
+        let actuated = coordinates()
+            .zip(&passive)
+            .map(|(coordinate, passive)| coordinate.actuated && !passive)
+            .collect();
+        let coordinate_map = self.coordinate_map()?;
+
+        for (group, spring) in self.groups[1..].iter_mut().zip(springs) {
+            if let Some(spring) = spring {
+                group.joint = group.joint.with_spring(spring.stiffness, spring.rest);
+            }
+        }
+        let ground = fixed_frame.unwrap_or_default().inverse();
+        let tree = self.build_tree(floating, &ground)?;
+        let attachment = |group: usize, pose: &RigidTransform| match group {
+            0 if !floating => Attachment { body: None, pose: ground * *pose },
+            _ => Attachment { body: Some(group - usize::from(!floating)), pose: *pose },
+        };
+        let links: Vec<NamedLink> = self
+            .description
+            .links
+            .iter()
+            .zip(&self.placed)
+            .map(|(link, placed)| {
+                // The empty root of a floating robot is the world itself.
+                let world = Attachment { body: None, pose: RigidTransform::identity() };
+                let attachment = placed.as_ref().map_or(world, |(group, pose)| attachment(*group, pose));
+                NamedLink { name: link.name.clone(), attachment }
+            })
+            .collect();
+        let mut shapes = Vec::new();
+        for (link, named) in self.description.links.iter().zip(&links) {
+            for shape in &link.shapes {
+                let NamedLink { name, attachment } = named;
+                let attachment = Attachment { body: attachment.body, pose: attachment.pose * shape.pose };
+                let (role, geometry, rgba) = (shape.role, shape.geometry, shape.rgba);
+                shapes.push(Shape { link: name.clone(), attachment, role, geometry, rgba });
+            }
+        }
+        if friction.iter().any(|&friction| friction != 0.0) {
+            self.warnings.push("dry joint friction is not simulated".to_owned());
+        }
+        let first = usize::from(!floating);
+        let mut model = RobotModel {
+            name: self.description.name.clone(),
+            file: self.file.to_owned(),
+            tree,
+            body_names: self.groups[first..].iter().map(|group| group.name.clone()).collect(),
+            joint_names,
+            limits,
+            actuated,
+            damping,
+            friction,
+            links,
+            shapes,
+            contacts: Vec::new(),
+            frames: Vec::new(),
+            soles: Vec::new(),
+            postures: Vec::new(),
+            coordinate_map,
+            warnings: self.warnings,
+        };
+        if let Some(companion) = companion {
+            companion.complete(&mut model)?;
+        }
+        Ok(model)
+    }
+
+    /// The coordinates of a planar joint must not take the name of another joint.
+    fn check_names(&self, names: &[String]) -> Result<(), RobotError> {
+        let mut seen = std::collections::HashSet::new();
+        let coordinates = self.groups.iter().filter_map(|group| group.coordinate.as_ref());
+        for (name, coordinate) in names.iter().zip(coordinates) {
+            if !seen.insert(name) {
+                return Err(
+                    self.refuse_joint(&self.description.joints[coordinate.joint], Rule::DuplicateName)
+                );
+            }
+        }
+        Ok(())
+    }
+
+    fn coordinate_map(&self) -> Result<CoordinateMap, RobotError> {
+        let description = self.description;
+        let mut coordinate_of_joint = vec![None; description.joints.len()];
+        let coordinates: Vec<&Coordinate> =
+            self.groups.iter().filter_map(|group| group.coordinate.as_ref()).collect();
+        for (place, coordinate) in coordinates.iter().enumerate() {
+            coordinate_of_joint[coordinate.joint] = Some(place);
+        }
+        let mut followers = Vec::new();
+        for (place, coordinate) in coordinates.iter().enumerate() {
+            let joint = &description.joints[coordinate.joint];
+            let Some((followed, multiplier, offset)) = joint.mimic else { continue };
+            let kind = match description.joints[followed].kind {
+                JointType::Revolute | JointType::Continuous | JointType::Prismatic => None,
+                JointType::Planar => Some("planar-mimicking"),
+                JointType::Floating => Some("floating-mimicking"),
+                _ => Some("fixed-mimicking"),
+            };
+            let source = match (kind, coordinate_of_joint[followed]) {
+                (None, Some(source)) => source,
+                (kind, _) => {
+                    let kind = kind.unwrap_or("fixed-mimicking");
+                    return Err(self.refuse_joint(joint, Rule::UnsupportedJoint { kind }));
+                }
+            };
+            followers.push(Follower { joint: place, source, multiplier, offset });
+        }
+        if followers.is_empty() {
+            return Ok(CoordinateMap::identity(coordinates.len()));
+        }
+        CoordinateMap::new(coordinates.len(), &followers).map_err(|(joint, through)| {
+            let through = coordinates[through].name.clone();
+            self.refuse_joint(&description.joints[coordinates[joint].joint], Rule::MimicCycle { through })
+        })
+    }
+
+    fn build_tree(&self, floating: bool, ground: &RigidTransform) -> Result<KinematicTree, RobotError> {
+        let gravity_w = self.options.gravity_w;
+        let mut builder = if floating {
+            TreeBuilder::floating_base(gravity_w, self.groups[0].link_inertia())
+        } else {
+            let mut builder = TreeBuilder::fixed_base(gravity_w);
+            builder.set_ground_inertia(self.groups[0].inertia.transformed(ground));
+            builder
+        };
+        for group in &self.groups[1..] {
+            let mut joint = group.joint;
+            let parent = match group.parent {
+                0 if !floating => {
+                    joint.placement = *ground * joint.placement;
+                    None
+                }
+                parent => Some(parent - usize::from(!floating)),
+            };
+            builder.add(Body::new(parent, joint, group.link_inertia()));
+        }
+        builder.build().map_err(|error| match body_of(&error) {
+            Some(body) => {
+                let group = &self.groups[body + usize::from(!floating)];
+                match (&group.coordinate, group.link) {
+                    (Some(coordinate), _) if matches!(error, ModelError::NegativeDamping { .. }) => {
+                        self.refuse_joint(&self.description.joints[coordinate.joint], Rule::Physics(error))
+                    }
+                    (_, Some(link)) => self.refuse_link(link, Rule::Physics(error)),
+                    (Some(coordinate), None) => {
+                        self.refuse_joint(&self.description.joints[coordinate.joint], Rule::Physics(error))
+                    }
+                    (None, None) => self.refuse_file(Rule::Physics(error)),
+                }
+            }
+            None => self.refuse_file(Rule::Physics(error)),
+        })
+    }
+}
+
+impl Group {
+    fn link_inertia(&self) -> LinkInertia {
+        if let Some(single) = self.single {
+            return single;
+        }
+        if self.inertia.mass <= 0.0 {
+            return LinkInertia::massless();
+        }
+        let (com, inertia) = self.inertia.to_central();
+        LinkInertia::new(self.inertia.mass, com, (inertia + inertia.transpose()) * 0.5)
+    }
+}
+
+/// Two directions in the plane with the given unit normal, and names for the three coordinates.
+fn plane(normal: &Vector3<f64>) -> ([Vector3<f64>; 2], [&'static str; 3]) {
+    let (x, y, z) = (Vector3::x(), Vector3::y(), Vector3::z());
+    if normal.x.abs() == 1.0 {
+        ([y, z], ["y", "z", "roll"])
+    } else if normal.y.abs() == 1.0 {
+        ([x, z], ["x", "z", "pitch"])
+    } else if normal.z.abs() == 1.0 {
+        ([x, y], ["x", "y", "yaw"])
+    } else {
+        // The coordinate axis farthest from the normal, projected.
+        let away = Vector3::ith(normal.iamin(), 1.0);
+        let first = (away - normal * normal.dot(&away)).normalize();
+        ([first, normal.cross(&first)], ["1", "2", "angle"])
+    }
+}
+
+fn body_of(error: &ModelError) -> Option<usize> {
+    match *error {
+        ModelError::NotFinite { body, .. }
+        | ModelError::AxisNotUnit { body, .. }
+        | ModelError::PlacementNotRotation { body, .. }
+        | ModelError::NegativeMass { body, .. }
+        | ModelError::InertiaNotSymmetric { body, .. }
+        | ModelError::InertiaNotPositive { body, .. }
+        | ModelError::InertiaTriangle { body, .. }
+        | ModelError::InertiaWithoutMass { body }
+        | ModelError::MasslessSubtree { body }
+        | ModelError::ParentAfterChild { body, .. }
+        | ModelError::NegativeDamping { body, .. }
+        | ModelError::NegativeDrag { body, .. }
+        | ModelError::Unsupported { body, .. } => Some(body),
+        _ => None,
+    }
+}

@@ -1,0 +1,351 @@
+//! The companion file `robot.toml` beside `robot.urdf`: what a URDF cannot say.
+//!
+//! ```toml
+//! format = 1
+//! passive = ["ankle"]                       # joints without a motor
+//!
+//! [[contact]]                               # points that may touch the ground, link frame
+//! name = "toe"
+//! link = "foot"
+//! position_m = [0.17, 0.0, -0.04]
+//! radius_m = 0.0                            # optional
+//!
+//! [[frame]]                                 # named frames, link frame
+//! name = "sole"
+//! link = "foot"
+//! position_m = [0.05, 0.0, -0.04]
+//! rpy_rad = [0.0, 0.0, 0.0]                 # optional
+//!
+//! [[sole]]                                  # support polygons
+//! name = "right"
+//! frame = "sole"
+//! corners = ["heel_right", "toe_right", "toe_left", "heel_left"]
+//!
+//! [[spring]]                                # joint springs (…_n_per_m and rest_m for a prismatic joint)
+//! joint = "ankle"
+//! stiffness_nm_per_rad = 0.1
+//! rest_rad = 0.0
+//!
+//! [[posture]]
+//! name = "stand"
+//! base_position_m = [0.0, 0.0, 0.8]         # pose of the base's link frame, optional
+//! base_rpy_rad = [0.0, 0.0, 0.0]
+//! [posture.joints]                          # others are 0
+//! ankle = 0.1
+//! ```
+//!
+//! Unknown keys are refused.
+
+use std::collections::{BTreeMap, HashSet};
+use std::path::{Path, PathBuf};
+
+use delmpc_mechanics::spatial::RigidTransform;
+use nalgebra::{Vector2, Vector3};
+use serde::Deserialize;
+use toml::Spanned;
+
+use crate::document::line_of;
+use crate::error::{RobotError, Rule, Subject, shorten};
+use crate::model::{Attachment, ContactPoint, NamedFrame, Posture, RobotModel, Sole};
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Tables {
+    format: Spanned<u32>,
+    #[serde(default)]
+    passive: Vec<Spanned<String>>,
+    #[serde(default)]
+    contact: Vec<Spanned<ContactTable>>,
+    #[serde(default)]
+    frame: Vec<Spanned<FrameTable>>,
+    #[serde(default)]
+    sole: Vec<Spanned<SoleTable>>,
+    #[serde(default)]
+    spring: Vec<Spanned<SpringTable>>,
+    #[serde(default)]
+    posture: Vec<Spanned<PostureTable>>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ContactTable {
+    name: String,
+    link: String,
+    position_m: [f64; 3],
+    #[serde(default)]
+    radius_m: f64,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FrameTable {
+    name: String,
+    link: String,
+    position_m: [f64; 3],
+    #[serde(default)]
+    rpy_rad: [f64; 3],
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct SoleTable {
+    name: String,
+    frame: String,
+    corners: Vec<String>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct SpringTable {
+    joint: String,
+    #[serde(alias = "stiffness_n_per_m")]
+    stiffness_nm_per_rad: f64,
+    #[serde(default, alias = "rest_m")]
+    rest_rad: f64,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct PostureTable {
+    name: String,
+    base_position_m: Option<[f64; 3]>,
+    base_rpy_rad: Option<[f64; 3]>,
+    #[serde(default)]
+    joints: BTreeMap<String, f64>,
+}
+
+/// A parsed companion file, not yet compared with the robot.
+pub(crate) struct CompanionFile {
+    path: PathBuf,
+    text: String,
+    tables: Tables,
+}
+
+/// A spring on a joint coordinate.
+pub(crate) struct Spring {
+    pub stiffness: f64,
+    pub rest: f64,
+}
+
+impl CompanionFile {
+    pub(crate) fn read(path: &Path, text: &str) -> Result<Self, RobotError> {
+        let tables: Tables = toml::from_str(text).map_err(|error| {
+            let line = error.span().map(|span| line_of(text, span.start));
+            let message: String = error.message().chars().take(300).collect();
+            RobotError::new(path, line, Subject::File, Rule::Toml(message))
+        })?;
+        let companion = Self { path: path.to_owned(), text: text.to_owned(), tables };
+        if *companion.tables.format.get_ref() != 1 {
+            let rule = Rule::Toml("format is not 1, the only one there is".to_owned());
+            return Err(companion.error(&companion.tables.format, "format", rule));
+        }
+        Ok(companion)
+    }
+
+    fn error<T>(&self, at: &Spanned<T>, entry: &str, rule: Rule) -> RobotError {
+        let line = line_of(&self.text, at.span().start);
+        RobotError::new(&self.path, Some(line), Subject::Entry(entry.to_owned()), rule)
+    }
+
+    /// Joint coordinates without a motor, and the springs, by coordinate.
+    pub(crate) fn joints(&self, names: &[String]) -> Result<(Vec<bool>, Vec<Option<Spring>>), RobotError> {
+        let find = |name: &str| names.iter().position(|joint| joint == name);
+        let unknown = |name: &str| Rule::Unknown { kind: "joint", name: shorten(name) };
+        let mut passive = vec![false; names.len()];
+        for name in &self.tables.passive {
+            let joint =
+                find(name.get_ref()).ok_or_else(|| self.error(name, "passive", unknown(name.get_ref())))?;
+            passive[joint] = true;
+        }
+        let mut springs: Vec<Option<Spring>> = names.iter().map(|_| None).collect();
+        for spring in &self.tables.spring {
+            let SpringTable { joint: name, stiffness_nm_per_rad: stiffness, rest_rad: rest } =
+                spring.get_ref();
+            let entry = format!("spring on `{}`", shorten(name));
+            let joint = find(name).ok_or_else(|| self.error(spring, &entry, unknown(name)))?;
+            if springs[joint].is_some() {
+                return Err(self.error(spring, &entry, Rule::DuplicateName));
+            }
+            if !(stiffness.is_finite() && *stiffness >= 0.0) {
+                return Err(self.error(spring, &entry, Rule::BadNumber { key: "stiffness" }));
+            }
+            if !rest.is_finite() {
+                return Err(self.error(spring, &entry, Rule::BadNumber { key: "rest" }));
+            }
+            springs[joint] = Some(Spring { stiffness: *stiffness, rest: *rest });
+        }
+        Ok((passive, springs))
+    }
+
+    /// Adds contacts, frames, soles and postures to a model whose links and joints are complete.
+    pub(crate) fn complete(&self, model: &mut RobotModel) -> Result<(), RobotError> {
+        self.add_contacts(model)?;
+        self.add_frames(model)?;
+        self.add_soles(model)?;
+        self.add_postures(model)
+    }
+
+    fn add_contacts(&self, model: &mut RobotModel) -> Result<(), RobotError> {
+        let mut names = HashSet::new();
+        for contact in &self.tables.contact {
+            let table = contact.get_ref();
+            let entry = format!("contact `{}`", shorten(&table.name));
+            let refuse = |rule| Err(self.error(contact, &entry, rule));
+            if !names.insert(table.name.as_str()) {
+                return refuse(Rule::DuplicateName);
+            }
+            if !table.position_m.iter().all(|x| x.is_finite()) {
+                return refuse(Rule::BadNumber { key: "position_m" });
+            }
+            if !(table.radius_m.is_finite() && table.radius_m >= 0.0) {
+                return refuse(Rule::BadNumber { key: "radius_m" });
+            }
+            let Some(link) = model.link(&table.link) else {
+                return refuse(Rule::Unknown { kind: "link", name: shorten(&table.link) });
+            };
+            let point = ContactPoint {
+                name: table.name.clone(),
+                link: table.link.clone(),
+                body: link.body,
+                position: link.pose.transform_point(&Vector3::from(table.position_m)),
+                radius: table.radius_m,
+            };
+            model.contacts.push(point);
+        }
+        Ok(())
+    }
+
+    fn add_frames(&self, model: &mut RobotModel) -> Result<(), RobotError> {
+        let mut names = HashSet::new();
+        for frame in &self.tables.frame {
+            let table = frame.get_ref();
+            let entry = format!("frame `{}`", shorten(&table.name));
+            let refuse = |rule| Err(self.error(frame, &entry, rule));
+            if !names.insert(table.name.as_str()) || model.link(&table.name).is_some() {
+                return refuse(Rule::DuplicateName);
+            }
+            if !table.position_m.iter().chain(&table.rpy_rad).all(|x| x.is_finite()) {
+                return refuse(Rule::BadNumber { key: "position_m or rpy_rad" });
+            }
+            let Some(link) = model.link(&table.link) else {
+                return refuse(Rule::Unknown { kind: "link", name: shorten(&table.link) });
+            };
+            let in_link =
+                RigidTransform::from_xyz_rpy(Vector3::from(table.position_m), Vector3::from(table.rpy_rad));
+            let attachment = Attachment { body: link.body, pose: link.pose * in_link };
+            let frame = NamedFrame { name: table.name.clone(), link: table.link.clone(), attachment };
+            model.frames.push(frame);
+        }
+        Ok(())
+    }
+
+    fn add_soles(&self, model: &mut RobotModel) -> Result<(), RobotError> {
+        let mut names = HashSet::new();
+        for sole in &self.tables.sole {
+            let table = sole.get_ref();
+            let entry = format!("sole `{}`", shorten(&table.name));
+            let refuse = |rule| Err(self.error(sole, &entry, rule));
+            if !names.insert(table.name.as_str()) {
+                return refuse(Rule::DuplicateName);
+            }
+            let Some(&frame) = model.frame(&table.frame) else {
+                return refuse(Rule::Unknown { kind: "frame", name: shorten(&table.frame) });
+            };
+            let (mut polygon, mut contacts, mut in_plane) = (Vec::new(), Vec::new(), true);
+            for corner in &table.corners {
+                let Some(index) = model.contacts.iter().position(|contact| contact.name == *corner) else {
+                    return refuse(Rule::Unknown { kind: "contact", name: shorten(corner) });
+                };
+                let contact = &model.contacts[index];
+                let point = frame.pose.inverse().transform_point(&contact.position);
+                // A tenth of a millimetre: soles in model files are flat to their last digit.
+                in_plane &= contact.body == frame.body && point.z.abs() < 1e-4;
+                polygon.push(point.xy());
+                contacts.push(index);
+            }
+            if !in_plane || !is_convex(&polygon) {
+                return refuse(Rule::SolePolygon);
+            }
+            model.soles.push(Sole {
+                name: table.name.clone(),
+                frame: table.frame.clone(),
+                polygon,
+                contacts,
+            });
+        }
+        Ok(())
+    }
+
+    fn add_postures(&self, model: &mut RobotModel) -> Result<(), RobotError> {
+        let mut names = HashSet::new();
+        for posture in &self.tables.posture {
+            let table = posture.get_ref();
+            let entry = format!("posture `{}`", shorten(&table.name));
+            let refuse = |rule| Err(self.error(posture, &entry, rule));
+            if !names.insert(table.name.as_str()) {
+                return refuse(Rule::DuplicateName);
+            }
+            let given = table.base_position_m.is_some() || table.base_rpy_rad.is_some();
+            let (position, rpy) =
+                (table.base_position_m.unwrap_or_default(), table.base_rpy_rad.unwrap_or_default());
+            if !position.iter().chain(&rpy).all(|x| x.is_finite()) {
+                return refuse(Rule::BadNumber { key: "base_position_m or base_rpy_rad" });
+            }
+            let base =
+                given.then(|| RigidTransform::from_xyz_rpy(Vector3::from(position), Vector3::from(rpy)));
+            let mut q = vec![0.0; model.joint_names.len()];
+            for (name, &value) in &table.joints {
+                let Some(joint) = model.joint(name) else {
+                    return refuse(Rule::Unknown { kind: "joint", name: shorten(name) });
+                };
+                if !value.is_finite() {
+                    return refuse(Rule::BadNumber { key: "a joint coordinate" });
+                }
+                let limits = &model.limits[joint];
+                if value < limits.lower || value > limits.upper {
+                    let name = shorten(name);
+                    model.warnings.push(format!(
+                        "{entry}: joint `{name}` at {value} is outside its limits {} to {}",
+                        limits.lower, limits.upper
+                    ));
+                }
+                q[joint] = value;
+            }
+            model.postures.push(Posture {
+                name: table.name.clone(),
+                base_link_pose_w: base.filter(|_| model.tree.is_floating()),
+                q,
+            });
+        }
+        Ok(())
+    }
+}
+
+/// Whether the corners are a convex polygon in counter-clockwise order: every corner is left of every edge it is not on.
+fn is_convex(polygon: &[Vector2<f64>]) -> bool {
+    let count = polygon.len();
+    count >= 3
+        && (0..count).all(|i| {
+            let (from, to) = (polygon[i], polygon[(i + 1) % count]);
+            (0..count)
+                .filter(|&k| k != i && k != (i + 1) % count)
+                .all(|k| (to - from).perp(&(polygon[k] - from)) > 0.0)
+        })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn convex_means_counter_clockwise_and_simple() {
+        let square = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]].map(Vector2::from);
+        assert!(is_convex(&square));
+        let mut clockwise = square;
+        clockwise.reverse();
+        assert!(!is_convex(&clockwise));
+        assert!(!is_convex(&[square[0], square[2], square[1], square[3]]));
+        assert!(!is_convex(&square[..2]));
+        assert!(!is_convex(&[square[0], square[1], square[1], square[3]]));
+    }
+}
