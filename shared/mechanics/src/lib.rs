@@ -5,6 +5,7 @@
 extern crate alloc;
 
 pub mod branch_lu;
+pub mod constraints;
 pub mod del_hessian;
 pub mod del_residual;
 pub mod dense_lu;

@@ -230,7 +230,10 @@ impl LoadResponse {
             hessian.evaluate(tree, del);
         }
         let Some(hessian) = self.hessian.as_ref().or_else(|| solver.hessian()) else {
-            return Err(ModelError::Unsupported { body: 0, reason: "the factorisation has no Hessian blocks" });
+            return Err(ModelError::Unsupported {
+                body: 0,
+                reason: "the factorisation has no Hessian blocks",
+            });
         };
         let work = EndMomenta {
             tree,
@@ -326,7 +329,8 @@ impl LoadResponse {
                 let x = del.body_pose(point.body, alpha).transform_point(&point.point_b);
                 let weight = del.rule().weights()[alpha];
                 if alpha < s {
-                    for &dof in &tree.branch(point.body)[tree.base_dof().min(tree.branch(point.body).len())..] {
+                    for &dof in &tree.branch(point.body)[tree.base_dof().min(tree.branch(point.body).len())..]
+                    {
                         let dof = dof as usize;
                         let linear = joint_point_rate(tree, del, dof, alpha, &x);
                         for k in 0..3 {
