@@ -25,7 +25,7 @@ use crate::del_hessian::DelHessian;
 use crate::del_residual::DelWorkspace;
 use crate::dense_lu::DenseLu;
 use crate::errors::FactorError;
-use crate::lanes::{Instructions, Kernel, LANES, Lane, Quad, Simd};
+use crate::lanes::{Instructions, Kernel, LANES, Lane, Quad, Simd, WideLane};
 use crate::lobatto::MAX_UNKNOWN_NODES;
 use crate::newton_direction::{BaseEntry, NewtonDirection, jacobian_column_rule};
 use crate::row_matrix::RowMatrix;
@@ -192,38 +192,12 @@ impl NewtonDirection for BranchLu {
     }
 
     fn solve(&mut self, tree: &KinematicTree, rhs: &mut [f64]) {
-        let s = self.s;
-        let mut pivoted = [0.0; MAX_UNKNOWN_NODES];
-        for dof in (tree.base_dof()..tree.dof()).rev() {
-            let branch = tree.branch(body_of(tree, dof));
-            let inverse = self.inverse_pivot(dof);
-            for alpha in 0..s {
-                pivoted[alpha] = (0..s).map(|k| inverse[alpha * s + k] * rhs[dof * s + k]).sum();
-            }
-            rhs[dof * s..(dof + 1) * s].copy_from_slice(&pivoted[..s]);
-            for (position, &a) in branch[..branch.len() - 1].iter().enumerate() {
-                for alpha in 0..s {
-                    let sum: f64 =
-                        (0..s).map(|k| self.column(dof, k, position * s + alpha) * pivoted[k]).sum();
-                    rhs[a as usize * s + alpha] -= sum;
-                }
-            }
-        }
+        let instructions = self.instructions;
+        instructions.dispatch(SolveOne { tree, lu: self, rhs, forward: true });
         if tree.is_floating() {
-            self.base.solve(&mut rhs[..6 * s]);
+            self.base.solve(&mut rhs[..6 * self.s]);
         }
-        for dof in tree.base_dof()..tree.dof() {
-            let branch = tree.branch(body_of(tree, dof));
-            for alpha in 0..s {
-                let mut sum = 0.0;
-                for (position, &b) in branch[..branch.len() - 1].iter().enumerate() {
-                    for k in 0..s {
-                        sum += self.row(dof, alpha, position * s + k) * rhs[b as usize * s + k];
-                    }
-                }
-                rhs[dof * s + alpha] -= sum;
-            }
-        }
+        instructions.dispatch(SolveOne { tree, lu: self, rhs, forward: false });
     }
 
     fn solve_transposed(&mut self, tree: &KinematicTree, rhs: &mut [f64]) {
@@ -403,9 +377,6 @@ fn subtract_rank<S: Simd, const N: usize>(
     }
 }
 
-/// Quads of right-hand sides that one sweep over the tree carries in registers.
-const CHUNK: usize = 2;
-
 struct ForwardMany<'a> {
     tree: &'a KinematicTree,
     lu: &'a BranchLu,
@@ -416,61 +387,48 @@ impl Kernel for ForwardMany<'_> {
     type Output = ();
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        match self.lu.s {
-            1 => sweep_forward::<S, 1>(simd, self, 1),
-            2 => sweep_forward::<S, 2>(simd, self, 2),
-            3 => sweep_forward::<S, 3>(simd, self, 3),
-            s => sweep_forward::<S, MAX_UNKNOWN_NODES>(simd, self, s),
-        }
-    }
-}
-
-#[inline(always)]
-fn sweep_forward<S: Simd, const N: usize>(simd: S, work: ForwardMany<'_>, s: usize) {
-    let stride = work.rhs.stride();
-    let mut start = 0;
-    while start < stride {
-        if start + CHUNK <= stride {
-            forward_chunk::<S, N, CHUNK>(simd, work.tree, work.lu, work.rhs.quads_mut(), stride, start, s);
-        } else {
-            for q in start..stride {
-                forward_chunk::<S, N, 1>(simd, work.tree, work.lu, work.rhs.quads_mut(), stride, q, s);
+        let Self { tree, lu, rhs } = self;
+        for at in (0..rhs.stride()).step_by(2) {
+            match lu.s {
+                1 => forward_chunk::<S, 1>(simd, tree, lu, rhs, at, 1),
+                2 => forward_chunk::<S, 2>(simd, tree, lu, rhs, at, 2),
+                3 => forward_chunk::<S, 3>(simd, tree, lu, rhs, at, 3),
+                s => forward_chunk::<S, MAX_UNKNOWN_NODES>(simd, tree, lu, rhs, at, s),
             }
         }
-        start += CHUNK;
     }
 }
 
+/// Leaves to root, eight columns at a time. Columns of the linearisation are zero outside a subtree: those rows are skipped.
 #[inline(always)]
-fn forward_chunk<S: Simd, const N: usize, const W: usize>(
+fn forward_chunk<S: Simd, const N: usize>(
     simd: S,
     tree: &KinematicTree,
     lu: &BranchLu,
-    data: &mut [Quad],
-    stride: usize,
+    rhs: &mut RowMatrix,
     at: usize,
     s: usize,
 ) {
-    let zero = Lane::splat(simd, 0.0);
+    let stride = rhs.stride();
+    let data = rhs.quads_mut();
+    let zero = WideLane::splat(simd, 0.0);
     for dof in (tree.base_dof()..tree.dof()).rev() {
-        let mut x = [[zero; W]; N];
+        let mut x = [zero; N];
+        let mut empty = true;
         for k in 0..s {
-            for w in 0..W {
-                x[k][w] = Lane::load(simd, &data[(dof * s + k) * stride + at + w]);
-            }
+            x[k] = WideLane::load(simd, data, (dof * s + k) * stride + at);
+            empty &= x[k].is_zero();
+        }
+        if empty {
+            continue;
         }
         let inverse = &lu.pivots[dof * s * s..(dof + 1) * s * s];
-        let mut y = [[zero; W]; N];
+        let mut y = [zero; N];
         for alpha in 0..s {
             for k in 0..s {
-                let factor = Lane::splat(simd, inverse[alpha * s + k]);
-                for w in 0..W {
-                    y[alpha][w] = factor.mul_add(x[k][w], y[alpha][w]);
-                }
+                y[alpha] = WideLane::splat(simd, inverse[alpha * s + k]).mul_add(x[k], y[alpha]);
             }
-            for w in 0..W {
-                data[(dof * s + alpha) * stride + at + w] = y[alpha][w].quad();
-            }
+            y[alpha].store(data, (dof * s + alpha) * stride + at);
         }
         let branch = tree.branch(body_of(tree, dof));
         let quads = lu.column_quads[dof];
@@ -478,17 +436,13 @@ fn forward_chunk<S: Simd, const N: usize, const W: usize>(
         for (position, &a) in branch[..branch.len() - 1].iter().enumerate() {
             for alpha in 0..s {
                 let entry = position * s + alpha;
-                let row = &mut data[(a as usize * s + alpha) * stride + at..][..W];
-                let mut sum: [Lane<S>; W] = core::array::from_fn(|w| Lane::load(simd, &row[w]));
+                let row = (a as usize * s + alpha) * stride + at;
+                let mut sum = WideLane::load(simd, data, row);
                 for k in 0..s {
-                    let factor = Lane::splat(simd, columns[k * quads + entry / LANES].0[entry % LANES]);
-                    for w in 0..W {
-                        sum[w] = factor.neg_mul_add(y[k][w], sum[w]);
-                    }
+                    let factor = columns[k * quads + entry / LANES].0[entry % LANES];
+                    sum = WideLane::splat(simd, factor).neg_mul_add(y[k], sum);
                 }
-                for w in 0..W {
-                    row[w] = sum[w].quad();
-                }
+                sum.store(data, row);
             }
         }
     }
@@ -504,69 +458,131 @@ impl Kernel for BackwardMany<'_> {
     type Output = ();
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        match self.lu.s {
-            1 => sweep_backward::<S, 1>(simd, self, 1),
-            2 => sweep_backward::<S, 2>(simd, self, 2),
-            3 => sweep_backward::<S, 3>(simd, self, 3),
-            s => sweep_backward::<S, MAX_UNKNOWN_NODES>(simd, self, s),
-        }
-    }
-}
-
-#[inline(always)]
-fn sweep_backward<S: Simd, const N: usize>(simd: S, work: BackwardMany<'_>, s: usize) {
-    let stride = work.rhs.stride();
-    let mut start = 0;
-    while start < stride {
-        if start + CHUNK <= stride {
-            backward_chunk::<S, N, CHUNK>(simd, work.tree, work.lu, work.rhs.quads_mut(), stride, start, s);
-        } else {
-            for q in start..stride {
-                backward_chunk::<S, N, 1>(simd, work.tree, work.lu, work.rhs.quads_mut(), stride, q, s);
+        let Self { tree, lu, rhs } = self;
+        for at in (0..rhs.stride()).step_by(2) {
+            match lu.s {
+                1 => backward_chunk::<S, 1>(simd, tree, lu, rhs, at, 1),
+                2 => backward_chunk::<S, 2>(simd, tree, lu, rhs, at, 2),
+                3 => backward_chunk::<S, 3>(simd, tree, lu, rhs, at, 3),
+                s => backward_chunk::<S, MAX_UNKNOWN_NODES>(simd, tree, lu, rhs, at, s),
             }
         }
-        start += CHUNK;
     }
 }
 
+/// Root to leaves, eight columns at a time.
 #[inline(always)]
-fn backward_chunk<S: Simd, const N: usize, const W: usize>(
+fn backward_chunk<S: Simd, const N: usize>(
     simd: S,
     tree: &KinematicTree,
     lu: &BranchLu,
-    data: &mut [Quad],
-    stride: usize,
+    rhs: &mut RowMatrix,
     at: usize,
     s: usize,
 ) {
-    let zero = Lane::splat(simd, 0.0);
+    let stride = rhs.stride();
+    let data = rhs.quads_mut();
+    let zero = WideLane::splat(simd, 0.0);
     for dof in tree.base_dof()..tree.dof() {
         let branch = tree.branch(body_of(tree, dof));
         let quads = lu.row_quads[dof];
         let rows = &lu.rows[lu.row_starts[dof]..lu.row_starts[dof] + s * quads];
-        let mut sum = [[zero; W]; N];
+        // Two accumulators per row hide the latency of the multiply-add.
+        let mut sums = [[zero; N]; 2];
         for alpha in 0..s {
-            for w in 0..W {
-                sum[alpha][w] = Lane::load(simd, &data[(dof * s + alpha) * stride + at + w]);
-            }
+            sums[0][alpha] = WideLane::load(simd, data, (dof * s + alpha) * stride + at);
         }
         for (position, &b) in branch[..branch.len() - 1].iter().enumerate() {
             for k in 0..s {
                 let entry = position * s + k;
-                let row = &data[(b as usize * s + k) * stride + at..][..W];
-                let y: [Lane<S>; W] = core::array::from_fn(|w| Lane::load(simd, &row[w]));
+                let y = WideLane::load(simd, data, (b as usize * s + k) * stride + at);
+                let sum = &mut sums[position % 2];
                 for alpha in 0..s {
-                    let factor = Lane::splat(simd, rows[alpha * quads + entry / LANES].0[entry % LANES]);
-                    for w in 0..W {
-                        sum[alpha][w] = factor.neg_mul_add(y[w], sum[alpha][w]);
-                    }
+                    let factor = rows[alpha * quads + entry / LANES].0[entry % LANES];
+                    sum[alpha] = WideLane::splat(simd, factor).neg_mul_add(y, sum[alpha]);
+                }
+            }
+        }
+        let one = WideLane::splat(simd, 1.0);
+        for alpha in 0..s {
+            let total = one.mul_add(sums[0][alpha], sums[1][alpha]);
+            total.store(data, (dof * s + alpha) * stride + at);
+        }
+    }
+}
+
+struct SolveOne<'a> {
+    tree: &'a KinematicTree,
+    lu: &'a BranchLu,
+    rhs: &'a mut [f64],
+    forward: bool,
+}
+
+impl Kernel for SolveOne<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run<S: Simd>(self, _simd: S) {
+        let Self { tree, lu, rhs, forward } = self;
+        match (forward, lu.s) {
+            (true, 1) => forward_one(tree, lu, rhs, 1),
+            (true, 2) => forward_one(tree, lu, rhs, 2),
+            (true, s) => forward_one(tree, lu, rhs, s),
+            (false, 1) => backward_one(tree, lu, rhs, 1),
+            (false, 2) => backward_one(tree, lu, rhs, 2),
+            (false, s) => backward_one(tree, lu, rhs, s),
+        }
+    }
+}
+
+#[inline(always)]
+fn forward_one(tree: &KinematicTree, lu: &BranchLu, rhs: &mut [f64], s: usize) {
+    let mut pivoted = [0.0; MAX_UNKNOWN_NODES];
+    for dof in (tree.base_dof()..tree.dof()).rev() {
+        let branch = tree.branch(body_of(tree, dof));
+        let inverse = &lu.pivots[dof * s * s..(dof + 1) * s * s];
+        let own = &mut rhs[dof * s..(dof + 1) * s];
+        for alpha in 0..s {
+            let mut sum = 0.0;
+            for k in 0..s {
+                sum += inverse[alpha * s + k] * own[k];
+            }
+            pivoted[alpha] = sum;
+        }
+        own.copy_from_slice(&pivoted[..s]);
+        let quads = lu.column_quads[dof];
+        let columns = &lu.columns[lu.column_starts[dof]..lu.column_starts[dof] + s * quads];
+        for (position, &a) in branch[..branch.len() - 1].iter().enumerate() {
+            let target = &mut rhs[a as usize * s..(a as usize + 1) * s];
+            for alpha in 0..s {
+                let entry = position * s + alpha;
+                let mut sum = target[alpha];
+                for k in 0..s {
+                    sum -= columns[k * quads + entry / LANES].0[entry % LANES] * pivoted[k];
+                }
+                target[alpha] = sum;
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn backward_one(tree: &KinematicTree, lu: &BranchLu, rhs: &mut [f64], s: usize) {
+    for dof in tree.base_dof()..tree.dof() {
+        let branch = tree.branch(body_of(tree, dof));
+        let quads = lu.row_quads[dof];
+        let rows = &lu.rows[lu.row_starts[dof]..lu.row_starts[dof] + s * quads];
+        let mut sums = [0.0; MAX_UNKNOWN_NODES];
+        for (position, &b) in branch[..branch.len() - 1].iter().enumerate() {
+            let from = &rhs[b as usize * s..(b as usize + 1) * s];
+            for alpha in 0..s {
+                for k in 0..s {
+                    let entry = position * s + k;
+                    sums[alpha] += rows[alpha * quads + entry / LANES].0[entry % LANES] * from[k];
                 }
             }
         }
         for alpha in 0..s {
-            for w in 0..W {
-                data[(dof * s + alpha) * stride + at + w] = sum[alpha][w].quad();
-            }
+            rhs[dof * s + alpha] -= sums[alpha];
         }
     }
 }

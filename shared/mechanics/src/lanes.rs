@@ -36,6 +36,43 @@ pub(crate) trait Simd: Copy {
     fn mul_add(self, a: Self::Lanes, b: Self::Lanes, c: Self::Lanes) -> Self::Lanes;
     /// `c - a b`.
     fn neg_mul_add(self, a: Self::Lanes, b: Self::Lanes, c: Self::Lanes) -> Self::Lanes;
+
+    /// Eight doubles: two neighbouring quads of a row of right-hand sides.
+    type Wide: Copy;
+    fn wide_splat(self, x: f64) -> Self::Wide;
+    fn wide_load(self, quads: &[Quad; 2]) -> Self::Wide;
+    fn wide_store(self, wide: Self::Wide) -> [Quad; 2];
+    /// `a b + c`.
+    fn wide_mul_add(self, a: Self::Wide, b: Self::Wide, c: Self::Wide) -> Self::Wide;
+    /// `c - a b`.
+    fn wide_neg_mul_add(self, a: Self::Wide, b: Self::Wide, c: Self::Wide) -> Self::Wide;
+}
+
+/// The wide operations of an instruction set whose widest register is one [`Simd::Lanes`].
+macro_rules! wide_as_two_lanes {
+    () => {
+        type Wide = [Self::Lanes; 2];
+        #[inline(always)]
+        fn wide_splat(self, x: f64) -> Self::Wide {
+            [self.splat(x); 2]
+        }
+        #[inline(always)]
+        fn wide_load(self, quads: &[Quad; 2]) -> Self::Wide {
+            [self.load(&quads[0]), self.load(&quads[1])]
+        }
+        #[inline(always)]
+        fn wide_store(self, wide: Self::Wide) -> [Quad; 2] {
+            [self.store(wide[0]), self.store(wide[1])]
+        }
+        #[inline(always)]
+        fn wide_mul_add(self, a: Self::Wide, b: Self::Wide, c: Self::Wide) -> Self::Wide {
+            [self.mul_add(a[0], b[0], c[0]), self.mul_add(a[1], b[1], c[1])]
+        }
+        #[inline(always)]
+        fn wide_neg_mul_add(self, a: Self::Wide, b: Self::Wide, c: Self::Wide) -> Self::Wide {
+            [self.neg_mul_add(a[0], b[0], c[0]), self.neg_mul_add(a[1], b[1], c[1])]
+        }
+    };
 }
 
 /// Plain arrays: what every processor can do.
@@ -48,6 +85,7 @@ fn zip(a: [f64; 4], b: [f64; 4], f: impl Fn(f64, f64) -> f64) -> [f64; 4] {
 }
 
 impl Simd for Portable {
+    wide_as_two_lanes!();
     type Lanes = [f64; 4];
     #[inline(always)]
     fn splat(self, x: f64) -> [f64; 4] {
@@ -85,6 +123,7 @@ impl Simd for Portable {
 
 #[cfg(target_arch = "x86_64")]
 impl Simd for pulp::x86::V3 {
+    wide_as_two_lanes!();
     type Lanes = pulp::f64x4;
     #[inline(always)]
     fn splat(self, x: f64) -> pulp::f64x4 {
@@ -120,6 +159,66 @@ impl Simd for pulp::x86::V3 {
     }
 }
 
+#[cfg(target_arch = "x86_64")]
+impl Simd for pulp::x86::V4 {
+    type Lanes = pulp::f64x4;
+    #[inline(always)]
+    fn splat(self, x: f64) -> pulp::f64x4 {
+        self.splat_f64x4(x)
+    }
+    #[inline(always)]
+    fn load(self, quad: &Quad) -> pulp::f64x4 {
+        pulp::cast(quad.0)
+    }
+    #[inline(always)]
+    fn store(self, lanes: pulp::f64x4) -> Quad {
+        Quad(pulp::cast(lanes))
+    }
+    #[inline(always)]
+    fn add(self, a: pulp::f64x4, b: pulp::f64x4) -> pulp::f64x4 {
+        self.add_f64x4(a, b)
+    }
+    #[inline(always)]
+    fn sub(self, a: pulp::f64x4, b: pulp::f64x4) -> pulp::f64x4 {
+        self.sub_f64x4(a, b)
+    }
+    #[inline(always)]
+    fn mul(self, a: pulp::f64x4, b: pulp::f64x4) -> pulp::f64x4 {
+        self.mul_f64x4(a, b)
+    }
+    #[inline(always)]
+    fn mul_add(self, a: pulp::f64x4, b: pulp::f64x4, c: pulp::f64x4) -> pulp::f64x4 {
+        self.mul_add_f64x4(a, b, c)
+    }
+    #[inline(always)]
+    fn neg_mul_add(self, a: pulp::f64x4, b: pulp::f64x4, c: pulp::f64x4) -> pulp::f64x4 {
+        self.negate_mul_add_f64x4(a, b, c)
+    }
+
+    type Wide = pulp::f64x8;
+    #[inline(always)]
+    fn wide_splat(self, x: f64) -> pulp::f64x8 {
+        self.splat_f64x8(x)
+    }
+    #[inline(always)]
+    fn wide_load(self, quads: &[Quad; 2]) -> pulp::f64x8 {
+        pulp::cast([quads[0].0, quads[1].0])
+    }
+    #[inline(always)]
+    fn wide_store(self, wide: pulp::f64x8) -> [Quad; 2] {
+        let [a, b]: [[f64; 4]; 2] = pulp::cast(wide);
+        [Quad(a), Quad(b)]
+    }
+    #[inline(always)]
+    fn wide_mul_add(self, a: pulp::f64x8, b: pulp::f64x8, c: pulp::f64x8) -> pulp::f64x8 {
+        self.mul_add_f64x8(a, b, c)
+    }
+    #[inline(always)]
+    fn wide_neg_mul_add(self, a: pulp::f64x8, b: pulp::f64x8, c: pulp::f64x8) -> pulp::f64x8 {
+        self.negate_mul_add_f64x8(a, b, c)
+    }
+}
+
 /// Work that runs under any instruction set. Implementations and all they call must be `#[inline(always)]`, so that
 /// the code is generated inside the function that enables the instructions.
 pub(crate) trait Kernel {
@@ -133,11 +232,17 @@ pub(crate) enum Instructions {
     Portable,
     #[cfg(target_arch = "x86_64")]
     V3(pulp::x86::V3),
+    #[cfg(target_arch = "x86_64")]
+    V4(pulp::x86::V4),
 }
 
 impl Instructions {
     /// The best the processor offers.
     pub fn detect() -> Self {
+        #[cfg(target_arch = "x86_64")]
+        if let Some(v4) = pulp::x86::V4::try_new() {
+            return Self::V4(v4);
+        }
         #[cfg(target_arch = "x86_64")]
         if let Some(v3) = pulp::x86::V3::try_new() {
             return Self::V3(v3);
@@ -151,23 +256,25 @@ impl Instructions {
         match self {
             Self::Portable => kernel.run(Portable),
             #[cfg(target_arch = "x86_64")]
-            Self::V3(v3) => pulp::Simd::vectorize(v3, OnV3 { kernel, v3 }),
+            Self::V3(v3) => pulp::Simd::vectorize(v3, With { kernel, simd: v3 }),
+            #[cfg(target_arch = "x86_64")]
+            Self::V4(v4) => pulp::Simd::vectorize(v4, With { kernel, simd: v4 }),
         }
     }
 }
 
 #[cfg(target_arch = "x86_64")]
-struct OnV3<K> {
+struct With<K, S> {
     kernel: K,
-    v3: pulp::x86::V3,
+    simd: S,
 }
 
 #[cfg(target_arch = "x86_64")]
-impl<K: Kernel> pulp::WithSimd for OnV3<K> {
+impl<K: Kernel, S: Simd> pulp::WithSimd for With<K, S> {
     type Output = K::Output;
     #[inline(always)]
     fn with_simd<P: pulp::Simd>(self, _: P) -> K::Output {
-        self.kernel.run(self.v3)
+        self.kernel.run(self.simd)
     }
 }
 
@@ -239,6 +346,49 @@ impl<S: Simd> Neg for Lane<S> {
     #[inline(always)]
     fn neg(self) -> Self {
         Self::splat(self.simd, 0.0) - self
+    }
+}
+
+/// Eight doubles with their token, for rows of right-hand sides.
+#[derive(Clone, Copy)]
+pub(crate) struct WideLane<S: Simd> {
+    simd: S,
+    wide: S::Wide,
+}
+
+impl<S: Simd> WideLane<S> {
+    #[inline(always)]
+    pub fn splat(simd: S, x: f64) -> Self {
+        Self { simd, wide: simd.wide_splat(x) }
+    }
+    /// The two quads of `row` from `at` on; zero when the row is too short (which the callers rule out).
+    #[inline(always)]
+    pub fn load(simd: S, row: &[Quad], at: usize) -> Self {
+        match row.get(at..).and_then(|rest| rest.first_chunk::<2>()) {
+            Some(quads) => Self { simd, wide: simd.wide_load(quads) },
+            None => Self::splat(simd, 0.0),
+        }
+    }
+    #[inline(always)]
+    pub fn store(self, row: &mut [Quad], at: usize) {
+        if let Some(quads) = row.get_mut(at..).and_then(|rest| rest.first_chunk_mut::<2>()) {
+            *quads = self.simd.wide_store(self.wide);
+        }
+    }
+    /// `self b + c`.
+    #[inline(always)]
+    pub fn mul_add(self, b: Self, c: Self) -> Self {
+        Self { wide: self.simd.wide_mul_add(self.wide, b.wide, c.wide), ..self }
+    }
+    /// `c - self b`.
+    #[inline(always)]
+    pub fn neg_mul_add(self, b: Self, c: Self) -> Self {
+        Self { wide: self.simd.wide_neg_mul_add(self.wide, b.wide, c.wide), ..self }
+    }
+    #[inline(always)]
+    pub fn is_zero(self) -> bool {
+        let [a, b] = self.simd.wide_store(self.wide);
+        a.0.iter().chain(&b.0).all(|x| *x == 0.0)
     }
 }
 

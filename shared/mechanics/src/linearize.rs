@@ -34,7 +34,7 @@ use crate::del_hessian::DelHessian;
 use crate::del_residual::DelWorkspace;
 use crate::errors::{ModelError, StepError};
 use crate::kinetic_hessian::KineticHessian;
-use crate::lanes::{Kernel, Lane, Quad, Simd};
+use crate::lanes::{Kernel, Simd, WideLane};
 use crate::mass_matrix_factor::MassMatrixFactor;
 use crate::newton_direction::{NewtonDirection, NewtonSolver};
 use crate::row_matrix::RowMatrix;
@@ -491,9 +491,6 @@ fn fill_right_hand_sides(
     }
 }
 
-/// Quads of columns carried in registers.
-const CHUNK: usize = 2;
-
 /// Rows of `q_{k+1}` (copied) and of `p_{k+1}`: `Σ_γ H[s,γ] Z^γ`, minus `K_q̇q Z^s` in velocity coordinates.
 struct EndRows<'a> {
     tree: &'a KinematicTree,
@@ -507,55 +504,42 @@ struct EndRows<'a> {
 impl Kernel for EndRows<'_> {
     type Output = ();
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
-        let stride = self.z.stride();
-        let (tree, hessian, kinetic) = (self.tree, self.hessian, self.kinetic);
-        let (z, out) = (self.z.quads(), self.out.quads_mut());
-        let mut at = 0;
-        while at < stride {
-            match (self.s, stride - at) {
-                (1, CHUNK..) => end_chunk::<S, CHUNK>(simd, tree, hessian, kinetic, z, out, stride, at, 1),
-                (2, CHUNK..) => end_chunk::<S, CHUNK>(simd, tree, hessian, kinetic, z, out, stride, at, 2),
-                (s, CHUNK..) => end_chunk::<S, CHUNK>(simd, tree, hessian, kinetic, z, out, stride, at, s),
-                (s, _) => end_chunk::<S, 1>(simd, tree, hessian, kinetic, z, out, stride, at, s),
+    fn run<S: Simd>(mut self, simd: S) {
+        for at in (0..self.z.stride()).step_by(2) {
+            match self.s {
+                1 => end_chunk(simd, &mut self, at, 1),
+                2 => end_chunk(simd, &mut self, at, 2),
+                s => end_chunk(simd, &mut self, at, s),
             }
-            at += if stride - at >= CHUNK { CHUNK } else { 1 };
         }
     }
 }
 
 #[inline(always)]
-#[allow(clippy::too_many_arguments)]
-fn end_chunk<S: Simd, const W: usize>(
-    simd: S,
-    tree: &KinematicTree,
-    hessian: &DelHessian,
-    kinetic: Option<&KineticHessian>,
-    z: &[Quad],
-    out: &mut [Quad],
-    stride: usize,
-    at: usize,
-    s: usize,
-) {
+fn end_chunk<S: Simd>(simd: S, work: &mut EndRows<'_>, at: usize, s: usize) {
+    let (tree, hessian) = (work.tree, work.hessian);
+    let stride = work.z.stride();
+    let z = work.z.quads();
+    let out = work.out.quads_mut();
     let n = tree.dof();
+    let zero = WideLane::splat(simd, 0.0);
     for i in 0..n {
-        for w in 0..W {
-            out[i * stride + at + w] = z[(i * s + s - 1) * stride + at + w];
-            out[(n + i) * stride + at + w] = Quad::ZERO;
-        }
+        WideLane::load(simd, z, (i * s + s - 1) * stride + at).store(out, i * stride + at);
+        zero.store(out, (n + i) * stride + at);
     }
     for i in 0..n {
-        let branch = tree.branch(i);
         let first = hessian.pair_starts[i];
-        let mut sum: [Lane<S>; W] = [Lane::splat(simd, 0.0); W];
-        for (position, &j) in branch.iter().enumerate() {
+        let mut sum = zero;
+        for (position, &j) in tree.branch(i).iter().enumerate() {
             let j = j as usize;
             let pair = first + position;
             let (mut own_rate, mut other_rate) = (0.0, 0.0);
-            if let Some(kinetic) = kinetic {
+            if let Some(kinetic) = work.kinetic {
                 let terms = kinetic.pair(i, position);
                 (own_rate, other_rate) = (terms[1].0[1], terms[2].0[1]);
             }
+            let target = (n + j) * stride + at;
+            let mut moved = WideLane::load(simd, out, target);
             for gamma in 1..=s {
                 let mut ahead = hessian.entry(pair, s, gamma);
                 let mut behind = hessian.mirrored(pair, s, gamma);
@@ -563,26 +547,17 @@ fn end_chunk<S: Simd, const W: usize>(
                     ahead -= own_rate;
                     behind -= other_rate;
                 }
-                let ahead = Lane::splat(simd, ahead);
-                let from = &z[(j * s + gamma - 1) * stride + at..][..W];
-                for w in 0..W {
-                    sum[w] = ahead.mul_add(Lane::load(simd, &from[w]), sum[w]);
-                }
+                let from = WideLane::load(simd, z, (j * s + gamma - 1) * stride + at);
+                sum = WideLane::splat(simd, ahead).mul_add(from, sum);
                 if i != j {
-                    let behind = Lane::splat(simd, behind);
-                    let own = &z[(i * s + gamma - 1) * stride + at..][..W];
-                    let target = &mut out[(n + j) * stride + at..][..W];
-                    for w in 0..W {
-                        let moved = behind.mul_add(Lane::load(simd, &own[w]), Lane::load(simd, &target[w]));
-                        target[w] = moved.quad();
-                    }
+                    let own = WideLane::load(simd, z, (i * s + gamma - 1) * stride + at);
+                    moved = WideLane::splat(simd, behind).mul_add(own, moved);
                 }
             }
+            moved.store(out, target);
         }
-        let target = &mut out[(n + i) * stride + at..][..W];
-        for w in 0..W {
-            target[w] = (Lane::load(simd, &target[w]) + sum[w]).quad();
-        }
+        let target = (n + i) * stride + at;
+        WideLane::splat(simd, 1.0).mul_add(sum, WideLane::load(simd, out, target)).store(out, target);
     }
 }
 
@@ -596,52 +571,29 @@ impl Kernel for SolveMass<'_> {
     type Output = ();
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let stride = self.out.stride();
-        let mut at = 0;
-        while at < stride {
-            if stride - at >= CHUNK {
-                mass_chunk::<S, CHUNK>(simd, self.factor, self.out.quads_mut(), stride, at);
-                at += CHUNK;
-            } else {
-                mass_chunk::<S, 1>(simd, self.factor, self.out.quads_mut(), stride, at);
-                at += 1;
+        let Self { factor, out } = self;
+        let stride = out.stride();
+        let n = factor.pivots().len();
+        let out = out.quads_mut();
+        for at in (0..stride).step_by(2) {
+            let row = |k: usize| (n + k) * stride + at;
+            for k in (0..n).rev() {
+                let own = WideLane::load(simd, out, row(k));
+                for &j in factor.ancestors(k) {
+                    let l = WideLane::splat(simd, factor.lower(k, j as usize));
+                    let target = row(j as usize);
+                    l.neg_mul_add(own, WideLane::load(simd, out, target)).store(out, target);
+                }
             }
-        }
-    }
-}
-
-#[inline(always)]
-fn mass_chunk<S: Simd, const W: usize>(
-    simd: S,
-    factor: &MassMatrixFactor,
-    out: &mut [Quad],
-    stride: usize,
-    at: usize,
-) {
-    let n = factor.pivots().len();
-    for k in (0..n).rev() {
-        let own: [Lane<S>; W] = core::array::from_fn(|w| Lane::load(simd, &out[(n + k) * stride + at + w]));
-        for &j in factor.ancestors(k) {
-            let l = Lane::splat(simd, factor.lower(k, j as usize));
-            let target = &mut out[(n + j as usize) * stride + at..][..W];
-            for w in 0..W {
-                target[w] = l.neg_mul_add(own[w], Lane::load(simd, &target[w])).quad();
+            for k in 0..n {
+                let scale = WideLane::splat(simd, 1.0 / factor.pivots()[k]);
+                let mut own = scale.mul_add(WideLane::load(simd, out, row(k)), WideLane::splat(simd, 0.0));
+                for &j in factor.ancestors(k) {
+                    let l = WideLane::splat(simd, factor.lower(k, j as usize));
+                    own = l.neg_mul_add(WideLane::load(simd, out, row(j as usize)), own);
+                }
+                own.store(out, row(k));
             }
-        }
-    }
-    for k in 0..n {
-        let scale = Lane::splat(simd, 1.0 / factor.pivots()[k]);
-        let mut own: [Lane<S>; W] =
-            core::array::from_fn(|w| scale * Lane::load(simd, &out[(n + k) * stride + at + w]));
-        for &j in factor.ancestors(k) {
-            let l = Lane::splat(simd, factor.lower(k, j as usize));
-            let from = &out[(n + j as usize) * stride + at..][..W];
-            for w in 0..W {
-                own[w] = l.neg_mul_add(Lane::load(simd, &from[w]), own[w]);
-            }
-        }
-        for w in 0..W {
-            out[(n + k) * stride + at + w] = own[w].quad();
         }
     }
 }
