@@ -237,7 +237,7 @@ impl NewtonDirection for BranchLu {
 
     fn solve_many(&mut self, tree: &KinematicTree, rhs: &mut RowMatrix) {
         let instructions = self.instructions;
-        instructions.dispatch(ForwardMany { tree, lu: self, rhs });
+        instructions.dispatch_wide(ForwardMany { tree, lu: self, rhs });
         if tree.is_floating() {
             for c in 0..rhs.columns() {
                 for (r, x) in self.base_rhs.iter_mut().enumerate() {
@@ -249,7 +249,7 @@ impl NewtonDirection for BranchLu {
                 }
             }
         }
-        instructions.dispatch(BackwardMany { tree, lu: self, rhs });
+        instructions.dispatch_wide(BackwardMany { tree, lu: self, rhs });
     }
 
     fn hessian(&self) -> Option<&DelHessian> {
@@ -267,10 +267,9 @@ impl Kernel for Eliminate<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) -> Self::Output {
         match self.lu.s {
-            1 => eliminate::<S, 1>(simd, self.tree, self.lu, 1),
-            2 => eliminate::<S, 2>(simd, self.tree, self.lu, 2),
-            3 => eliminate::<S, 3>(simd, self.tree, self.lu, 3),
-            4 => eliminate::<S, 4>(simd, self.tree, self.lu, 4),
+            1 if S::SPECIALISE => eliminate::<S, 1>(simd, self.tree, self.lu, 1),
+            2 if S::SPECIALISE => eliminate::<S, 2>(simd, self.tree, self.lu, 2),
+            3 if S::SPECIALISE => eliminate::<S, 3>(simd, self.tree, self.lu, 3),
             s => eliminate::<S, MAX_UNKNOWN_NODES>(simd, self.tree, self.lu, s),
         }
     }
@@ -390,9 +389,9 @@ impl Kernel for ForwardMany<'_> {
         let Self { tree, lu, rhs } = self;
         for at in (0..rhs.stride()).step_by(2) {
             match lu.s {
-                1 => forward_chunk::<S, 1>(simd, tree, lu, rhs, at, 1),
-                2 => forward_chunk::<S, 2>(simd, tree, lu, rhs, at, 2),
-                3 => forward_chunk::<S, 3>(simd, tree, lu, rhs, at, 3),
+                1 if S::SPECIALISE => forward_chunk::<S, 1>(simd, tree, lu, rhs, at, 1),
+                2 if S::SPECIALISE => forward_chunk::<S, 2>(simd, tree, lu, rhs, at, 2),
+                3 if S::SPECIALISE => forward_chunk::<S, 3>(simd, tree, lu, rhs, at, 3),
                 s => forward_chunk::<S, MAX_UNKNOWN_NODES>(simd, tree, lu, rhs, at, s),
             }
         }
@@ -461,9 +460,9 @@ impl Kernel for BackwardMany<'_> {
         let Self { tree, lu, rhs } = self;
         for at in (0..rhs.stride()).step_by(2) {
             match lu.s {
-                1 => backward_chunk::<S, 1>(simd, tree, lu, rhs, at, 1),
-                2 => backward_chunk::<S, 2>(simd, tree, lu, rhs, at, 2),
-                3 => backward_chunk::<S, 3>(simd, tree, lu, rhs, at, 3),
+                1 if S::SPECIALISE => backward_chunk::<S, 1>(simd, tree, lu, rhs, at, 1),
+                2 if S::SPECIALISE => backward_chunk::<S, 2>(simd, tree, lu, rhs, at, 2),
+                3 if S::SPECIALISE => backward_chunk::<S, 3>(simd, tree, lu, rhs, at, 3),
                 s => backward_chunk::<S, MAX_UNKNOWN_NODES>(simd, tree, lu, rhs, at, s),
             }
         }

@@ -166,7 +166,11 @@ impl DelHessian {
         if self.time_step != del.time_step {
             self.fill_tables(del);
         }
+        del.instructions.dispatch(Composites { tree, del, hessian: self });
         del.instructions.dispatch(Assemble { tree, del, hessian: self });
+        if tree.is_floating() {
+            del.instructions.dispatch(BasePairs { tree, del, hessian: self });
+        }
     }
 
     fn fill_tables(&mut self, del: &DelWorkspace) {
@@ -257,9 +261,8 @@ impl Kernel for Assemble<'_> {
     fn run<S: Simd>(self, simd: S) {
         // With constant arguments the loops over nodes unroll.
         match (self.hessian.s, self.hessian.groups) {
-            (1, 1) => assemble(simd, self, 1, 1),
-            (2, 1) => assemble(simd, self, 2, 1),
-            (3, 1) => assemble(simd, self, 3, 1),
+            (1, 1) if S::SPECIALISE => assemble(simd, self, 1, 1),
+            (2, 1) if S::SPECIALISE => assemble(simd, self, 2, 1),
             (s, groups) => assemble(simd, self, s, groups),
         }
     }
@@ -268,16 +271,47 @@ impl Kernel for Assemble<'_> {
 #[inline(always)]
 fn assemble<S: Simd>(simd: S, work: Assemble<'_>, s: usize, groups: usize) {
     let Assemble { tree, del, hessian } = work;
-    composites(simd, tree, del, hessian, groups);
-    if tree.is_floating() {
-        for g in 0..groups {
-            base_columns(simd, &del.base[g], hessian, groups, g);
-        }
-    }
     for i in tree.first_joint_body()..tree.body_count() {
         joint_pairs(simd, tree, del, hessian, i, s, groups);
     }
-    if tree.is_floating() {
+}
+
+struct Composites<'a> {
+    tree: &'a KinematicTree,
+    del: &'a DelWorkspace,
+    hessian: &'a mut DelHessian,
+}
+
+impl Kernel for Composites<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { tree, del, hessian } = self;
+        let groups = hessian.groups;
+        composites(simd, tree, del, hessian, groups);
+        if tree.is_floating() {
+            for g in 0..groups {
+                base_columns(simd, &del.base[g], hessian, groups, g);
+                for i in tree.first_joint_body()..tree.body_count() {
+                    joint_base_terms(simd, tree, del, hessian, i, g);
+                }
+            }
+        }
+    }
+}
+
+struct BasePairs<'a> {
+    tree: &'a KinematicTree,
+    del: &'a DelWorkspace,
+    hessian: &'a mut DelHessian,
+}
+
+impl Kernel for BasePairs<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { tree, del, hessian } = self;
+        let (s, groups) = (hessian.s, hessian.groups);
         base_pairs(simd, tree, del, hessian, s, groups);
         if !hessian.general.is_empty() {
             for i in 0..tree.body_count() {
@@ -532,9 +566,6 @@ fn joint_pairs<S: Simd>(
         let twist = load(simd, &body.joint_twist);
         let c = fixed_direction_row(simd, tree, del, hessian, i, at, twist);
         rows[g] = RowLanes { a: store(a), b: store(b), c: store(c) };
-        if tree.is_floating() {
-            joint_base_terms(simd, tree, del, hessian, i, g);
-        }
     }
     let tables = Tables {
         mass: &hessian.mass_table,
@@ -673,6 +704,17 @@ fn base_pairs<S: Simd>(
     };
     let mass = tree.constants()[0].subtree_mass;
     let block = (s + 1) * groups;
+    // N(μ), Ṅ(μ), N(Γ) of every group.
+    let mut curved = [[[Quad::ZERO; 18]; 3]; MAX_GROUPS];
+    for g in 0..groups {
+        let (base, body) = (&del.base[g], &del.bodies[g]);
+        let momentum = load(simd, &body.momentum);
+        curved[g] = [
+            store(second_order(simd, base, momentum)),
+            store(second_order_rate(simd, base, momentum)),
+            store(second_order(simd, base, load(simd, &body.impulse))),
+        ];
+    }
     for k in 0..6 {
         for l in 0..6 {
             let mut terms = PairTerms::default();
@@ -702,17 +744,15 @@ fn base_pairs<S: Simd>(
                     k_row = k_row + dot6(row_twist, matrix_times(simd, &general.nu, twist));
                 }
                 let mut scaled = step * stiffness;
-                let base = &del.base[g];
+                let [n, n_rate, n_impulse] = &curved[g];
                 if l < 3 {
-                    let n = second_order(simd, base, momentum);
-                    let n_rate = second_order_rate(simd, base, momentum);
-                    let n_impulse = second_order(simd, base, load(simd, &body.impulse));
-                    k_column = k_column + n[3 * k + l];
-                    scaled = step.mul_add(n_rate[3 * k + l], scaled) + n_impulse[3 * k + l];
+                    let at = 3 * k + l;
+                    k_column = k_column + Lane::load(simd, &n[at]);
+                    scaled = step.mul_add(Lane::load(simd, &n_rate[at]), scaled);
+                    scaled = scaled + Lane::load(simd, &n_impulse[at]);
                 }
                 if k < 3 {
-                    let n = second_order(simd, base, momentum);
-                    k_row = k_row + n[3 * l + k];
+                    k_row = k_row + Lane::load(simd, &n[3 * l + k]);
                 }
                 terms.mass[g] = dot6(row_twist, carried).quad();
                 terms.stiffness[g] = scaled.quad();

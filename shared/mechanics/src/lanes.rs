@@ -25,6 +25,8 @@ impl Quad {
 
 /// Arithmetic on four lanes with one instruction set.
 pub(crate) trait Simd: Copy {
+    /// Whether kernels are worth compiling once per common number of nodes (it costs build time).
+    const SPECIALISE: bool;
     type Lanes: Copy;
     fn splat(self, x: f64) -> Self::Lanes;
     fn load(self, quad: &Quad) -> Self::Lanes;
@@ -85,6 +87,7 @@ fn zip(a: [f64; 4], b: [f64; 4], f: impl Fn(f64, f64) -> f64) -> [f64; 4] {
 }
 
 impl Simd for Portable {
+    const SPECIALISE: bool = false;
     wide_as_two_lanes!();
     type Lanes = [f64; 4];
     #[inline(always)]
@@ -123,6 +126,7 @@ impl Simd for Portable {
 
 #[cfg(target_arch = "x86_64")]
 impl Simd for pulp::x86::V3 {
+    const SPECIALISE: bool = true;
     wide_as_two_lanes!();
     type Lanes = pulp::f64x4;
     #[inline(always)]
@@ -161,6 +165,7 @@ impl Simd for pulp::x86::V3 {
 
 #[cfg(target_arch = "x86_64")]
 impl Simd for pulp::x86::V4 {
+    const SPECIALISE: bool = true;
     type Lanes = pulp::f64x4;
     #[inline(always)]
     fn splat(self, x: f64) -> pulp::f64x4 {
@@ -233,19 +238,18 @@ pub(crate) enum Instructions {
     #[cfg(target_arch = "x86_64")]
     V3(pulp::x86::V3),
     #[cfg(target_arch = "x86_64")]
-    V4(pulp::x86::V4),
+    V4(pulp::x86::V3, pulp::x86::V4),
 }
 
 impl Instructions {
     /// The best the processor offers.
     pub fn detect() -> Self {
         #[cfg(target_arch = "x86_64")]
-        if let Some(v4) = pulp::x86::V4::try_new() {
-            return Self::V4(v4);
-        }
-        #[cfg(target_arch = "x86_64")]
         if let Some(v3) = pulp::x86::V3::try_new() {
-            return Self::V3(v3);
+            return match pulp::x86::V4::try_new() {
+                Some(v4) => Self::V4(v3, v4),
+                None => Self::V3(v3),
+            };
         }
         Self::Portable
     }
@@ -256,9 +260,17 @@ impl Instructions {
         match self {
             Self::Portable => kernel.run(Portable),
             #[cfg(target_arch = "x86_64")]
-            Self::V3(v3) => pulp::Simd::vectorize(v3, With { kernel, simd: v3 }),
+            Self::V3(v3) | Self::V4(v3, _) => pulp::Simd::vectorize(v3, With { kernel, simd: v3 }),
+        }
+    }
+
+    /// Runs a kernel that works on rows of eight: those gain from the widest registers, the others have four lanes anyway.
+    #[inline(always)]
+    pub fn dispatch_wide<K: Kernel>(self, kernel: K) -> K::Output {
+        match self {
             #[cfg(target_arch = "x86_64")]
-            Self::V4(v4) => pulp::Simd::vectorize(v4, With { kernel, simd: v4 }),
+            Self::V4(_, v4) => pulp::Simd::vectorize(v4, With { kernel, simd: v4 }),
+            other => other.dispatch(kernel),
         }
     }
 }

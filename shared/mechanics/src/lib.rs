@@ -1,4 +1,52 @@
 //! Linear-time higher-order variational integrators on kinematic trees.
+//!
+//! The mechanics of T. Fan, J. Schultz, T. Murphey, *Efficient computation of higher-order variational integrators in robotic
+//! simulation and trajectory optimization* ("the paper"): O(n) evaluation of the discrete Euler-Lagrange (DEL) equations, an
+//! exact O(n) Newton direction and an O(n²) linearisation, at any Lobatto order. Beyond the paper: its missing Algorithm B.1,
+//! a branch-sparse block LU for robots, a chart-free floating base with exact momentum, constraints with the full order in
+//! the momenta.
+//!
+//! # Reading order
+//!
+//! | step | module | what |
+//! |---|---|---|
+//! | model | [`spatial`], [`tree`], [`reroot`] | SE(3), trees of revolute and prismatic joints, re-rooting |
+//! | nodes | [`lobatto`], [`state`], [`forces`] | control nodes of a step, the state `(q, p)`, Assumption 1 |
+//! | equations | [`del_residual`], [`floating_base`] | Algorithm 1; rows of a floating base |
+//! | derivatives | [`tangent`], [`kinetic_hessian`], [`gravity_hessian`], [`del_hessian`] | Algorithm T, Algorithms 2 and 3, `H[α,γ]` |
+//! | Newton | [`newton_direction`], [`recursive_newton`], [`branch_lu`], [`dense_lu`], [`step`] | Algorithm B.1 and its rivals; the step |
+//! | use | [`linearize`], [`constraints`], [`velocity`] | `A`, `B`; points, loops, welds; velocities from momenta |
+//! | classics | [`kinematics`], [`mass_matrix`], [`mass_matrix_factor`], [`inverse_dynamics`], [`energy`] | continuous mechanics |
+//!
+//! # Letters
+//!
+//! | paper | here | meaning |
+//! |---|---|---|
+//! | `s`, `α, β, γ` | [`lobatto::LobattoRule`] | unknown nodes per step, node indices 0..s |
+//! | `w^α, b^{αβ}, a^{αβ}` | the same | weights, differentiation matrix, `w^β b^{βα}` |
+//! | `g_i, S_i, v_i, M_i, μ_i, Γ_i` | [`del_residual`] | pose, joint twist, velocity, inertia, articulated momentum and impulse, all in frame {0} |
+//! | `r^α` | [`del_residual`] | DEL residual |
+//! | `J`, `H[α,γ]` | [`del_hessian`] | Newton matrix, derivative of row α by node γ |
+//! | `A_k, B_k` | [`linearize`] | discrete linearisation |
+//!
+//! 6-vectors are angular first. Suffix `_w`: in frame {0} (the paper's bar); `_b`: in body axes. Units are SI; angles in rad.
+//!
+//! # Errata of the printed paper
+//!
+//! 1. Algorithm 2, line 4: `Ad_{g_i}ᵀ M_i Ad_{g_i}⁻¹` must be `Ad_{g_i}⁻ᵀ M_i Ad_{g_i}⁻¹`.
+//! 2. Algorithm 3, line 10: `S_jᵀ σA` (6 against 3 rows) must be `s_jᵀ σA` with the angular part of `S_j`.
+//! 3. Section 3.2: `δq = -J r` must be `δq = -J⁻¹ r`; section 3.3 iii: `(Dh·J·A)⁻¹` must be `(Dh·J⁻¹·A)⁻¹`.
+//! 4. Equation (6c) lacks the multiplier of the end node: the printed momentum is only first-order accurate
+//!    ([`constraints`]).
+//! 5. "Accuracy of order 2s" holds for `q` and `p` at step boundaries, not for rates at nodes (order s).
+//! 6. The passes of B.1 cost O(s³ n), not O(s² n); O(n²) for `A`, `B` covers the Hessian, the solves come on top.
+//! 7. With Euler-angle virtual joints, angular momentum is conserved only to O(Δt^{2s}); [`floating_base`] has it exact.
+//!
+//! # Conventions of the crate
+//!
+//! The model ([`tree::KinematicTree`]) is immutable; every algorithm has one workspace that is allocated once. Nothing is
+//! allocated in a step. Errors are values that name body, quantity and amount. Without default features the crate is
+//! `no_std` (with `alloc` for constructors).
 #![cfg_attr(not(feature = "std"), no_std)]
 #![forbid(unsafe_code)]
 

@@ -183,7 +183,7 @@ impl Linearizer {
         );
         solver.solve_many(tree, &mut self.z);
         let hessian = solver.hessian().unwrap_or(&self.hessian);
-        del.instructions.dispatch(EndRows {
+        del.instructions.dispatch_wide(EndRows {
             tree,
             hessian,
             kinetic: self.kinetic.as_ref(),
@@ -193,7 +193,7 @@ impl Linearizer {
         });
         self.add_direct_terms(tree, del, solver);
         if self.kinetic.is_some() {
-            del.instructions.dispatch(SolveMass { factor: &self.factor, out: &mut self.step.matrix });
+            del.instructions.dispatch_wide(SolveMass { factor: &self.factor, out: &mut self.step.matrix });
         }
         Ok(&self.step)
     }
@@ -507,8 +507,8 @@ impl Kernel for EndRows<'_> {
     fn run<S: Simd>(mut self, simd: S) {
         for at in (0..self.z.stride()).step_by(2) {
             match self.s {
-                1 => end_chunk(simd, &mut self, at, 1),
-                2 => end_chunk(simd, &mut self, at, 2),
+                1 if S::SPECIALISE => end_chunk(simd, &mut self, at, 1),
+                2 if S::SPECIALISE => end_chunk(simd, &mut self, at, 2),
                 s => end_chunk(simd, &mut self, at, s),
             }
         }

@@ -261,12 +261,11 @@ impl Kernel for Factor<'_> {
     type Output = Result<(), FactorError>;
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) -> Self::Output {
-        // With constant arguments the loops over nodes and rows unroll (reduced interface: 12, 21, 30 inputs).
+        // With constant arguments the loops over nodes and rows unroll (reduced interface: 12, 21 inputs).
         let (s, eta) = (self.work.shape.s, self.work.shape.eta);
         match (s, eta) {
-            (1, 3) => factor(simd, self, Interface { s: 1, eta: 3, first_impulse: 1 }),
-            (2, 3) => factor(simd, self, Interface { s: 2, eta: 3, first_impulse: 1 }),
-            (3, 3) => factor(simd, self, Interface { s: 3, eta: 3, first_impulse: 1 }),
+            (1, 3) if S::SPECIALISE => factor(simd, self, Interface { s: 1, eta: 3, first_impulse: 1 }),
+            (2, 3) if S::SPECIALISE => factor(simd, self, Interface { s: 2, eta: 3, first_impulse: 1 }),
             _ => {
                 let shape = self.work.shape;
                 factor(simd, self, shape)

@@ -8,7 +8,7 @@ use alloc::vec::Vec;
 
 use crate::energy::{generalised_momentum_into, kinetic_energy, potential_energy};
 use crate::errors::StepError;
-use crate::kinematics::{Configuration, Kinematics, Velocity};
+use crate::kinematics::{Configuration, Kinematics, Velocity, check_length};
 use crate::mass_matrix::{MassMatrixWorkspace, mass_matrix_into};
 use crate::mass_matrix_factor::MassMatrixFactor;
 use crate::spatial::Twist;
@@ -46,6 +46,8 @@ impl VelocityWorkspace {
         state: &State,
         velocity: &mut [f64],
     ) -> Result<(), StepError> {
+        check_length("velocity", velocity.len(), tree.dof())?;
+        check_length("momenta p", state.p.len(), tree.dof())?;
         self.factor_at(tree, state)?;
         velocity.copy_from_slice(&state.p);
         self.factor.solve_in_place(velocity)?;
@@ -67,7 +69,7 @@ impl VelocityWorkspace {
         Ok(())
     }
 
-    /// Kinetic and potential energy of a state, J (springs included).
+    /// Kinetic and potential energy of a state, J (springs included). Allocates one vector: for tests and logs.
     ///
     /// # Errors
     /// When the state does not fit the tree or the mass matrix is singular.
