@@ -1,0 +1,229 @@
+//! What is chosen for a controller: times, weights, limits.
+
+use alloc::vec;
+use alloc::vec::Vec;
+
+use crate::errors::ControlError;
+use crate::fallback::FallbackConfig;
+use crate::projected_qp::ProjectedQpOptions;
+use crate::reference::Reach;
+use crate::tasks::TaskWeights;
+
+/// Which law controls.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ControllerKind {
+    /// Model-predictive control.
+    #[default]
+    Mpc,
+    /// A fixed LQR about the home posture; torques are clamped by the plant. The baseline.
+    StaticLqr,
+    /// No torque.
+    Off,
+}
+
+/// Some stages of equal length.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StageBlock {
+    /// How many.
+    pub count: usize,
+    /// Length of each, s.
+    pub seconds: f64,
+}
+
+/// The constraints of the horizon.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ConstraintConfig {
+    /// Part of the effort limit the plan may use.
+    pub torque_fraction: f64,
+    /// Coefficient of friction counted on.
+    pub friction: f64,
+    /// Sides of the friction pyramid.
+    pub friction_sides: usize,
+    /// Distance of the pressure point from the sole's edges, m.
+    pub cop_margin_m: f64,
+    /// Yaw torque per normal force, m.
+    pub yaw_arm_m: f64,
+    /// Least normal force as a part of the weight.
+    pub min_force_fraction: f64,
+    /// Cost per N of a contact force beyond its cone (moments: per 0.1 N·m).
+    pub contact_penalty: f64,
+    /// Cost per rad of a joint beyond its position limit.
+    pub position_penalty: f64,
+    /// Cost per rad/s of a joint beyond its velocity limit.
+    pub velocity_penalty: f64,
+}
+
+impl Default for ConstraintConfig {
+    fn default() -> Self {
+        Self {
+            torque_fraction: 0.98,
+            friction: 0.6,
+            friction_sides: 8,
+            cop_margin_m: 0.008,
+            yaw_arm_m: 0.06,
+            min_force_fraction: 0.1,
+            contact_penalty: 1.0,
+            position_penalty: 1e4,
+            velocity_penalty: 1e3,
+        }
+    }
+}
+
+/// Everything that is chosen.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ControllerConfig {
+    /// Which law.
+    pub kind: ControllerKind,
+    /// Time between cycles, s.
+    pub period_s: f64,
+    /// From the time of a measurement to the time its command takes effect, s.
+    pub delay_s: f64,
+    /// The horizon, fine stages first.
+    pub stages: Vec<StageBlock>,
+    /// Weights of the tasks.
+    pub weights: TaskWeights,
+    /// Constraints.
+    pub constraints: ConstraintConfig,
+    /// The constrained QP.
+    pub qp: ProjectedQpOptions,
+    /// A reach, if any.
+    pub reach: Option<Reach>,
+    /// When to fall back.
+    pub fallback: FallbackConfig,
+    /// Oldest measurement that is used, s.
+    pub max_state_age_s: f64,
+    /// How long a command may be applied, s.
+    pub command_life_s: f64,
+    /// Time a cycle may take before it is called late, s.
+    pub budget_s: f64,
+    /// Innovation of the joint rates (root mean square over joints, rad/s) that is called a model mismatch when it lasts.
+    pub mismatch_rate: f64,
+}
+
+impl Default for ControllerConfig {
+    /// 200 Hz, one cycle of delay, 20 stages over 0.7 s.
+    fn default() -> Self {
+        let stages = vec![
+            StageBlock { count: 6, seconds: 0.01 },
+            StageBlock { count: 5, seconds: 0.02 },
+            StageBlock { count: 9, seconds: 0.06 },
+        ];
+        Self {
+            kind: ControllerKind::Mpc,
+            period_s: 0.005,
+            delay_s: 0.005,
+            stages,
+            weights: TaskWeights::default(),
+            constraints: ConstraintConfig::default(),
+            qp: ProjectedQpOptions::default(),
+            reach: None,
+            fallback: FallbackConfig::default(),
+            max_state_age_s: 0.05,
+            command_life_s: 0.1,
+            budget_s: 0.005,
+            mismatch_rate: 1.0,
+        }
+    }
+}
+
+impl ControllerConfig {
+    /// Stage lengths for a horizon of `horizon_s` in `count` stages: about a third of them fine (10 ms), a quarter of 20 ms, the
+    /// rest equal and coarse.
+    pub fn stages_for(horizon_s: f64, count: usize) -> Vec<StageBlock> {
+        let (fine, middle) = (count * 3 / 10, count / 4);
+        let coarse = count.saturating_sub(fine + middle).max(1);
+        let unit = horizon_s / 1.0;
+        let rest = horizon_s - unit * (0.01 * fine as f64 + 0.02 * middle as f64);
+        let blocks = [
+            StageBlock { count: fine, seconds: 0.01 * unit },
+            StageBlock { count: middle, seconds: 0.02 * unit },
+            StageBlock { count: coarse, seconds: rest / coarse as f64 },
+        ];
+        blocks.into_iter().filter(|block| block.count > 0).collect()
+    }
+
+    /// Length of every stage, s.
+    pub fn stage_lengths(&self) -> Vec<f64> {
+        self.stages.iter().flat_map(|block| core::iter::repeat_n(block.seconds, block.count)).collect()
+    }
+
+    /// Checks every number.
+    ///
+    /// # Errors
+    /// The first one found unusable.
+    pub fn check(&self) -> Result<(), ControlError> {
+        let positive = |quantity, value: f64| {
+            if value.is_finite() && value > 0.0 {
+                Ok(())
+            } else {
+                Err(ControlError::Value { quantity, index: 0, value, rule: "must be positive and finite" })
+            }
+        };
+        let not_negative = |quantity, value: f64| {
+            if value.is_finite() && value >= 0.0 {
+                Ok(())
+            } else {
+                Err(ControlError::Value {
+                    quantity,
+                    index: 0,
+                    value,
+                    rule: "must be finite and not negative",
+                })
+            }
+        };
+        positive("period", self.period_s)?;
+        not_negative("delay", self.delay_s)?;
+        positive("state age", self.max_state_age_s)?;
+        positive("command life", self.command_life_s)?;
+        positive("cycle budget", self.budget_s)?;
+        positive("mismatch rate", self.mismatch_rate)?;
+        let lengths = self.stage_lengths();
+        if lengths.is_empty() || lengths.len() > 200 {
+            let value = lengths.len() as f64;
+            return Err(ControlError::Value {
+                quantity: "stages",
+                index: 0,
+                value,
+                rule: "must be 1 to 200",
+            });
+        }
+        for (index, &value) in lengths.iter().enumerate() {
+            if !(value.is_finite() && value > 0.0 && value <= 0.2) {
+                let rule = "must be positive and at most 0.2 s";
+                return Err(ControlError::Value { quantity: "stage length", index, value, rule });
+            }
+        }
+        let c = &self.constraints;
+        positive("torque fraction", c.torque_fraction)?;
+        positive("contact penalty", c.contact_penalty)?;
+        positive("position penalty", c.position_penalty)?;
+        positive("velocity penalty", c.velocity_penalty)?;
+        not_negative("pressure point margin", c.cop_margin_m)?;
+        not_negative("least normal force", c.min_force_fraction)?;
+        let w = &self.weights;
+        for value in [w.posture, w.joint_speed, w.hand, w.hand_velocity, w.swing_foot_rotation]
+            .into_iter()
+            .chain(w.com)
+            .chain(w.com_velocity)
+            .chain(w.spin)
+            .chain(w.swing_foot)
+        {
+            not_negative("task weight", value)?;
+        }
+        positive("torque weight", w.torque)?;
+        if let Some(reach) = &self.reach {
+            positive("reach deadline", reach.deadline_s)?;
+            positive("reach return", reach.return_s)?;
+            not_negative("reach hold", reach.hold_s)?;
+            for value in reach.ball_m.into_iter().chain([reach.start_s]) {
+                not_negative("reach", value.abs())?;
+            }
+        }
+        let qp = &self.qp;
+        if qp.capacity == 0 || qp.rows_per_round == 0 || qp.max_rounds == 0 {
+            let rule = "needs room for rows, rows per round and rounds";
+            return Err(ControlError::Value { quantity: "QP", index: 0, value: 0.0, rule });
+        }
+        positive("QP tolerance", qp.tolerance)
+    }
+}

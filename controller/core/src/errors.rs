@@ -1,0 +1,85 @@
+//! Why a controller could not be made, and why a sub-problem could not be solved.
+
+use delmpc_mechanics::errors::{ModelError, StepError};
+
+/// Why a [`crate::cycle::Controller`] could not be made. Belongs to start-up only: a cycle always answers.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum ControlError {
+    /// A quantity has the wrong number of entries.
+    #[error("{quantity} has {found} entries, expected {expected}")]
+    Length {
+        /// Which quantity.
+        quantity: &'static str,
+        /// Its length.
+        found: usize,
+        /// The length needed.
+        expected: usize,
+    },
+    /// A number of the model or the configuration is not usable.
+    #[error("{quantity} is {value} at index {index}: {rule}")]
+    Value {
+        /// Which quantity.
+        quantity: &'static str,
+        /// Index in it.
+        index: usize,
+        /// The value found.
+        value: f64,
+        /// What it must be.
+        rule: &'static str,
+    },
+    /// More joints than a message has room for, or a tree that does not fit the controller.
+    #[error("the model is not usable: {reason}")]
+    Model {
+        /// What is wrong.
+        reason: &'static str,
+    },
+    /// A stage or terminal Hessian is not positive definite.
+    #[error("the Riccati recursion broke down: H is not positive definite at stage {stage}")]
+    NotPositiveDefinite {
+        /// Stage of the horizon.
+        stage: usize,
+    },
+    /// The infinite-horizon problem has no stabilising solution.
+    #[error(
+        "the terminal Riccati equation did not converge in {iterations} doublings (last change {change:e}): posture or weights leave a mode without control"
+    )]
+    NoStabilisingSolution {
+        /// Doublings made.
+        iterations: usize,
+        /// Relative change in the last one.
+        change: f64,
+    },
+    /// The mechanics refused the model.
+    #[error(transparent)]
+    Mechanics(#[from] ModelError),
+    /// The mechanics could not take a step at the goal posture.
+    #[error(transparent)]
+    Step(#[from] StepError),
+}
+
+/// Why a dual QP was not solved.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum QpError {
+    /// The data or the answer hold a NaN or an infinity.
+    #[error("QP data or solution are not finite")]
+    NotFinite,
+    /// The iteration stopped before its tolerance.
+    #[error("the QP solver stopped after {iterations} iterations without reaching its tolerance")]
+    NotConverged {
+        /// Iterations made.
+        iterations: u32,
+    },
+    /// More rows than the solver has room for.
+    #[error("{rows} rows, room for {capacity}")]
+    TooLarge {
+        /// Rows asked for.
+        rows: usize,
+        /// Rows there is room for.
+        capacity: usize,
+    },
+    /// The solver refused its data.
+    #[error("the QP solver refused its data")]
+    Refused,
+}

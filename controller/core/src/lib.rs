@@ -1,0 +1,57 @@
+//! Whole-body model-predictive control on a variational integrator: one control cycle.
+//!
+//! ```text
+//! PlantState -> estimator -> shift the plan -> linearise every stage -> Riccati -> projected QP -> Command
+//! ```
+//!
+//! Each cycle is one real-time iteration: the last plan, shifted in time, is linearised stage by stage with the variational
+//! integrator; the time-varying LQR and a small dual QP over the constraints that matter give the next plan; the command carries
+//! its first torque, gain and reference point. [`cycle::Controller::cycle`] always answers.
+//!
+//! Without the default feature `clarabel` the crate is `no_std` and needs `alloc` in constructors only; the QP is then solved by
+//! [`active_set_dual`].
+//!
+//! Reading order: [`model`], [`config`], [`cycle`]; then in the order of the cycle [`estimator`], [`plan`], [`stage_dynamics`],
+//! [`node_kinematics`], [`tasks`], [`reference`], [`contact_wrench`], [`lq_problem`], [`riccati`], [`dare`], [`projected_qp`],
+//! [`dual_qp`], [`fallback`].
+#![cfg_attr(not(feature = "std"), no_std)]
+#![forbid(unsafe_code)]
+
+extern crate alloc;
+#[cfg(all(test, not(feature = "std")))]
+extern crate std;
+
+pub mod active_set_dual;
+#[cfg(feature = "clarabel")]
+pub mod clarabel_dual;
+pub mod config;
+pub mod contact_wrench;
+pub mod cycle;
+pub mod dare;
+pub mod dual_qp;
+pub mod errors;
+pub mod estimator;
+pub mod fallback;
+pub(crate) mod kernels;
+pub mod lq_problem;
+pub mod model;
+pub mod node_kinematics;
+pub mod plan;
+pub mod posture_goal;
+pub mod projected_qp;
+pub mod reference;
+pub mod riccati;
+#[cfg(feature = "clarabel")]
+pub mod sparse_qp;
+pub mod stage_dynamics;
+pub mod tasks;
+
+/// What a process needs to run a controller.
+pub mod prelude {
+    pub use crate::config::{ConstraintConfig, ControllerConfig, ControllerKind, StageBlock};
+    pub use crate::cycle::{Clock, Controller, StoppedClock};
+    pub use crate::errors::ControlError;
+    pub use crate::model::{BodyPoint, ControllerModel, JointLimits, StanceObservation};
+    pub use crate::reference::Reach;
+    pub use crate::tasks::TaskWeights;
+}

@@ -1,0 +1,146 @@
+//! Kinematics, mass centre and total momentum at one node of the horizon, with their derivatives.
+//!
+//! ```text
+//! P = Σ M_i v_i        ∂P/∂q̇_j = 𝓜_j S_j        ∂P/∂q_j = 𝓜_j Ṡ_j - ad^D_{μ_j} S_j        Ṡ_j = ad_{v_j} S_j
+//! ```
+//!
+//! with the composite inertia `𝓜_j` and momentum `μ_j` of everything beyond joint j, all about the origin of {0}. The second one is
+//! (I3), (I4) of the mechanics handbook summed over the subtree: with `η = S_j` and `ν = Ṡ_j` for every body beyond j,
+//! `δ(M v) = M ν - ad^D_{M v} η`. Mass centre: `m ċ` is the linear part of `P`, so `∂c/∂q = ∂ċ/∂q̇` is that of `𝓜_j S_j / m`.
+//!
+//! Cost: O(n), no allocation after [`NodeKinematics::new`]. Fixed base.
+//!
+//! Source: R. Featherstone, *Rigid Body Dynamics Algorithms*, 2008, section 2.13 for composite momenta; own derivation.
+
+use alloc::vec;
+use alloc::vec::Vec;
+
+use delmpc_mechanics::errors::ModelError;
+use delmpc_mechanics::kinematics::{Configuration, Kinematics, Velocity};
+use delmpc_mechanics::spatial::{Momentum, SpatialInertia, Twist};
+use delmpc_mechanics::tree::KinematicTree;
+use nalgebra::Vector3;
+
+/// Everything tasks and contact wrench need to know of one node.
+#[derive(Clone, Debug)]
+pub struct NodeKinematics {
+    kinematics: Kinematics,
+    composite: Vec<SpatialInertia>,
+    subtree_momentum: Vec<Momentum>,
+    d_momentum_d_rate: Vec<Momentum>,
+    d_momentum_d_q: Vec<Momentum>,
+    momentum: Momentum,
+    com: Vector3<f64>,
+    mass: f64,
+}
+
+impl NodeKinematics {
+    /// Room for a tree with a fixed base.
+    pub fn new(tree: &KinematicTree) -> Self {
+        let n = tree.body_count();
+        Self {
+            kinematics: Kinematics::new(tree),
+            composite: vec![SpatialInertia::default(); n],
+            subtree_momentum: vec![Momentum::default(); n],
+            d_momentum_d_rate: vec![Momentum::default(); n],
+            d_momentum_d_q: vec![Momentum::default(); n],
+            momentum: Momentum::default(),
+            com: Vector3::zeros(),
+            mass: tree.total_mass(),
+        }
+    }
+
+    /// Evaluates at `(q, q̇)`.
+    ///
+    /// # Errors
+    /// [`ModelError::Length`] when a slice does not fit the tree.
+    pub fn update(&mut self, tree: &KinematicTree, q: &[f64], q_dot: &[f64]) -> Result<(), ModelError> {
+        self.kinematics.update(tree, &Configuration::fixed(q), &Velocity::fixed(q_dot))?;
+        for i in 0..tree.body_count() {
+            let inertia = self.kinematics.inertia_w(tree, i);
+            self.subtree_momentum[i] = inertia.mul_twist(&self.kinematics.velocities_w()[i]);
+            self.composite[i] = inertia;
+        }
+        self.momentum = Momentum::default();
+        for i in (0..tree.body_count()).rev() {
+            let (inertia, momentum) = (self.composite[i], self.subtree_momentum[i]);
+            match tree.bodies()[i].parent {
+                Some(parent) => {
+                    self.composite[parent] += inertia;
+                    self.subtree_momentum[parent] += momentum;
+                }
+                None => self.momentum += momentum,
+            }
+            let twist = self.kinematics.joint_twists_w()[i];
+            let twist_rate = self.kinematics.velocities_w()[i].bracket(&twist);
+            self.d_momentum_d_rate[i] = inertia.mul_twist(&twist);
+            self.d_momentum_d_q[i] = inertia.mul_twist(&twist_rate) - momentum.dual_bracket(&twist);
+        }
+        self.com = self.kinematics.mass_centre_of_tree_w(tree);
+        Ok(())
+    }
+
+    /// Poses and twists of all bodies.
+    pub fn kinematics(&self) -> &Kinematics {
+        &self.kinematics
+    }
+
+    /// Total momentum about the origin of {0}.
+    pub fn momentum(&self) -> Momentum {
+        self.momentum
+    }
+
+    /// `∂P/∂q̇_j`.
+    pub fn d_momentum_d_rate(&self, joint: usize) -> Momentum {
+        self.d_momentum_d_rate[joint]
+    }
+
+    /// `∂P/∂q_j`.
+    pub fn d_momentum_d_q(&self, joint: usize) -> Momentum {
+        self.d_momentum_d_q[joint]
+    }
+
+    /// Mass centre, mass welded to the ground included, m.
+    pub fn com(&self) -> Vector3<f64> {
+        self.com
+    }
+
+    /// Velocity of the mass centre, m/s.
+    pub fn com_velocity(&self) -> Vector3<f64> {
+        self.momentum.force / self.mass
+    }
+
+    /// `∂c/∂q_j`.
+    pub fn d_com_d_q(&self, joint: usize) -> Vector3<f64> {
+        self.d_momentum_d_rate[joint].force / self.mass
+    }
+
+    /// `∂ċ/∂q_j`.
+    pub fn d_com_velocity_d_q(&self, joint: usize) -> Vector3<f64> {
+        self.d_momentum_d_q[joint].force / self.mass
+    }
+
+    /// Position in {0} and velocity of a point of a body (link frame).
+    pub fn point(&self, body: usize, point: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
+        (self.kinematics.point_w(body, point), self.kinematics.point_velocity_w(body, point))
+    }
+
+    /// Derivatives of a point's position and velocity by `q_j`, for `j` on the branch of the point's body. The derivative of the
+    /// velocity by `q̇_j` is that of the position by `q_j`.
+    ///
+    /// The body's twist varies by `δv = ad_{v_j - v} S_j` ((I2) with `η = S_j`, `ν = Ṡ_j`).
+    pub fn d_point_d_q(
+        &self,
+        body: usize,
+        point_w: &Vector3<f64>,
+        joint: usize,
+    ) -> (Vector3<f64>, Vector3<f64>) {
+        let twist = self.kinematics.joint_twists_w()[joint];
+        let velocity = self.kinematics.velocities_w()[body];
+        let moved = twist.linear + twist.angular.cross(point_w);
+        let relative: Twist = self.kinematics.velocities_w()[joint] - velocity;
+        let change = relative.bracket(&twist);
+        let rate = change.linear + change.angular.cross(point_w) + velocity.angular.cross(&moved);
+        (moved, rate)
+    }
+}

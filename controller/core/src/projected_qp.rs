@@ -1,0 +1,424 @@
+//! The constrained problem as a projection, solved through its small dual with row generation.
+//!
+//! **From the LQ problem to a projection.** With `u_k = K_k x_k + k_k + v_k` the cost is a constant plus `½ Σ v_k' H_k v_k`
+//! ([`crate::riccati`]). Let `H_k = L_k L_k'` and `w_k = L_k' v_k`. Every constraint row of the horizon is affine in
+//! `w = (w_0, .., w_{N-1})`, since `x` is; write row i as `g_i' w <= h_i` with `h_i` its slack on the LQR trajectory (`w = 0`). So
+//!
+//! ```text
+//! min ½ |w|² + Σ_soft ρ_i max(0, g_i'w - h_i)     s.t.  G_hard w <= h_hard                                          (P)
+//! ```
+//!
+//! the projection of the origin on a polyhedron. Its Lagrange dual: `w = -G'y` minimises the Lagrangian, and a penalty `ρ max(0, t)`
+//! is `max_{0<=y<=ρ} y t`, hence
+//!
+//! ```text
+//! min ½ y'(G G')y + h'y     s.t.  0 <= y <= ρ      (ρ = ∞: hard)                                                    (D)
+//! ```
+//!
+//! with as many unknowns as rows. `y_i < ρ_i`: the soft row holds; `y_i = ρ_i`: it gives way by `g_i'w - h_i`.
+//!
+//! **Rows of G by one adjoint sweep.** For a row `F u_j + E x_j` at stage j, with `u = Kx + k + v`:
+//!
+//! ```text
+//! w_j part:  L_j⁻¹ F'           λ_j = E' + K_j' F'
+//! w_i part:  L_i⁻¹ B_i' λ_{i+1}      λ_i = A_i' λ_{i+1} + K_i' (B_i' λ_{i+1})        i = j-1 .. 0
+//! ```
+//!
+//! All new rows sweep together, one matrix product per stage. Rows are scaled to `|g_i| = 1` (`y` and `ρ` with them).
+//!
+//! **Row generation.** On the LQR trajectory no row violated: it is the optimum, nothing is solved. Otherwise the most violated
+//! rows enter, (D) is solved, the trajectory of `w = -G'y` is checked over the whole horizon, rows newly violated enter, until none
+//! is. The optimum over the rows that entered which violates no other row is the optimum over all. When the
+//! room is used up, rows with `y = 0` make place; if there are none, the remaining violated ones are counted as dropped.
+//!
+//! Cost: one rollout O(N n²) per round, one sweep O(j n²) per row, one small QP per round. No allocation after
+//! [`ProjectedQp::new`], other than the backend's.
+//!
+//! Source: own formulation (design section 5.6); the dual of a projection: S. Boyd, L. Vandenberghe, *Convex Optimization*, 2004,
+//! section 5.2; exact penalty: R. Fletcher, *Practical Methods of Optimization*, 1987, section 12.3.
+
+use alloc::boxed::Box;
+use alloc::vec;
+use alloc::vec::Vec;
+
+use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
+use faer::{Accum, Mat, Par};
+
+use crate::active_set_dual::ActiveSetDual;
+use crate::dual_qp::QpSolver;
+use crate::errors::QpError;
+use crate::kernels::{gemm, gemv, vector_mut};
+use crate::lq_problem::{LqProblem, LqSize, RowId, RowTag};
+use crate::riccati::{Riccati, Trajectory};
+
+/// How the row generation proceeds.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ProjectedQpOptions {
+    /// Rows the dual has room for.
+    pub capacity: usize,
+    /// Rows that may enter per round.
+    pub rows_per_round: usize,
+    /// Rounds after which the last trajectory is taken as it is.
+    pub max_rounds: u32,
+    /// A row is violated beyond this part of its scale.
+    pub tolerance: f64,
+}
+
+impl Default for ProjectedQpOptions {
+    fn default() -> Self {
+        Self { capacity: 64, rows_per_round: 24, max_rounds: 8, tolerance: 1e-6 }
+    }
+}
+
+/// A constraint that gave way, or was left out.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Violation {
+    /// Which row.
+    pub row: RowId,
+    /// What it limits.
+    pub tag: RowTag,
+    /// By how much, in the row's own unit.
+    pub amount: f64,
+}
+
+/// What a constrained solve took and found.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ProjectedQpReport {
+    /// Dual problems solved; 0: the LQR solution is the optimum.
+    pub solves: u32,
+    /// Iterations of the backend, summed.
+    pub iterations: u32,
+    /// Rows with a positive multiplier at the end.
+    pub active_rows: u32,
+    /// Violated rows left out because there was no room, or the rounds were over.
+    pub dropped_rows: u32,
+    /// Solves in which the backend failed and the built-in active-set method answered instead.
+    pub backend_failures: u32,
+    /// The largest violation relative to its scale that remains.
+    pub worst: Option<Violation>,
+}
+
+/// Workspace of the constrained solve.
+#[derive(Debug)]
+pub struct ProjectedQp {
+    size: LqSize,
+    options: ProjectedQpOptions,
+    rows: Vec<RowId>,
+    /// `G'`: one column of length `N n_u` per row.
+    row_vectors: Mat<f64>,
+    gram: Mat<f64>,
+    /// Norm every row was divided by.
+    row_norm: Vec<f64>,
+    slack: Vec<f64>,
+    upper: Vec<f64>,
+    y: Vec<f64>,
+    /// `λ` of the rows in a sweep, one per column, and `B'λ`.
+    adjoint: Mat<f64>,
+    next_adjoint: Mat<f64>,
+    projected: Mat<f64>,
+    row_buffer: Vec<f64>,
+    w: Vec<f64>,
+    v: Mat<f64>,
+    lqr: Trajectory,
+    violated: Vec<(f64, RowId)>,
+    row_values: Vec<f64>,
+    spare: ActiveSetDual,
+}
+
+impl ProjectedQp {
+    /// Room for problems of this size.
+    pub fn new(size: LqSize, options: ProjectedQpOptions) -> Self {
+        let LqSize { states, inputs, stages, rows } = size;
+        let capacity = options.capacity;
+        let total_rows = (stages + 1) * (2 * (inputs + states) + rows);
+        Self {
+            size,
+            options,
+            rows: Vec::with_capacity(capacity),
+            row_vectors: Mat::zeros(stages * inputs, capacity),
+            gram: Mat::zeros(capacity, capacity),
+            row_norm: vec![1.0; capacity],
+            slack: vec![0.0; capacity],
+            upper: vec![0.0; capacity],
+            y: vec![0.0; capacity],
+            adjoint: Mat::zeros(states, capacity),
+            next_adjoint: Mat::zeros(states, capacity),
+            projected: Mat::zeros(inputs, capacity),
+            row_buffer: vec![0.0; inputs + states],
+            w: vec![0.0; stages * inputs],
+            v: Mat::zeros(inputs, stages),
+            lqr: Trajectory::new(size),
+            violated: Vec::with_capacity(total_rows),
+            row_values: vec![0.0; rows],
+            spare: ActiveSetDual::new(capacity),
+        }
+    }
+
+    /// Solves the constrained problem from the first column of `trajectory.x`, with the factors of `riccati`.
+    ///
+    /// The trajectory is always finite when the problem's data are: a backend that fails is replaced by the active-set method, and
+    /// if that fails too the last good iterate stands.
+    ///
+    /// # Errors
+    /// [`QpError::NotFinite`] when even the LQR trajectory is not finite.
+    pub fn solve(
+        &mut self,
+        problem: &LqProblem,
+        riccati: &Riccati,
+        backend: &mut dyn QpSolver,
+        trajectory: &mut Trajectory,
+    ) -> Result<ProjectedQpReport, QpError> {
+        let mut report = ProjectedQpReport::default();
+        self.rows.clear();
+        riccati.rollout(problem, None, trajectory);
+        if !trajectory.is_finite() {
+            return Err(QpError::NotFinite);
+        }
+        self.lqr.copy_from(trajectory);
+
+        for _ in 0..self.options.max_rounds {
+            self.find_violated(problem, trajectory, &mut report);
+            let entered = self.admit(problem, riccati);
+            report.dropped_rows = self.violated.len() as u32;
+            if entered == 0 {
+                break;
+            }
+            if !self.solve_dual(backend, &mut report) {
+                break;
+            }
+            self.recover(riccati);
+            riccati.rollout(problem, Some(&self.v), trajectory);
+            if !trajectory.is_finite() {
+                trajectory.copy_from(&self.lqr);
+                break;
+            }
+        }
+        if report.solves > 0 {
+            self.find_violated(problem, trajectory, &mut report);
+            report.dropped_rows = self.violated.len() as u32;
+        }
+        report.active_rows = self.y[..self.rows.len()].iter().filter(|y| **y > 0.0).count() as u32;
+        Ok(report)
+    }
+
+    /// Rows in the last dual and their multipliers (in the row's own unit).
+    pub fn multipliers(&self) -> impl Iterator<Item = (RowId, f64)> + '_ {
+        self.rows.iter().enumerate().map(|(i, row)| (*row, self.y[i] / self.row_norm[i]))
+    }
+
+    /// Lists the violated rows that are not in the dual, most violated first, and notes the worst violation of all.
+    fn find_violated(
+        &mut self,
+        problem: &LqProblem,
+        trajectory: &Trajectory,
+        report: &mut ProjectedQpReport,
+    ) {
+        let Self { rows, violated, row_values, options, .. } = self;
+        violated.clear();
+        report.worst = None;
+        let mut worst_relative = 0.0;
+        problem.visit_rows(
+            &trajectory.x,
+            &trajectory.u,
+            options.tolerance,
+            row_values,
+            |row, amount, scale| {
+                let relative = amount / scale;
+                if relative > worst_relative {
+                    worst_relative = relative;
+                    report.worst = Some(Violation { row, tag: problem.tag(row), amount });
+                }
+                if !rows.contains(&row) && violated.len() < violated.capacity() {
+                    violated.push((relative, row));
+                }
+            },
+        );
+        violated.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    }
+
+    /// Lets the most violated rows into the dual and computes their columns; returns how many.
+    fn admit(&mut self, problem: &LqProblem, riccati: &Riccati) -> usize {
+        let wanted = self.violated.len().min(self.options.rows_per_round);
+        if wanted == 0 {
+            return 0;
+        }
+        if self.rows.len() + wanted > self.options.capacity {
+            self.make_room();
+        }
+        let first = self.rows.len();
+        let entered = wanted.min(self.options.capacity - first);
+        self.rows.extend(self.violated.drain(..entered).map(|(_, row)| row));
+        // The sweep takes the rows from the last stage to the first.
+        self.rows[first..].sort_unstable_by(|a, b| b.cmp(a));
+        self.sweep(problem, riccati, first);
+        self.complete_rows(problem, first);
+        entered
+    }
+
+    /// Removes the rows without a multiplier.
+    fn make_room(&mut self) {
+        let mut kept = 0;
+        for i in 0..self.rows.len() {
+            if self.y[i] <= 0.0 {
+                continue;
+            }
+            if kept != i {
+                self.rows[kept] = self.rows[i];
+                self.row_norm[kept] = self.row_norm[i];
+                self.slack[kept] = self.slack[i];
+                self.upper[kept] = self.upper[i];
+                self.y[kept] = self.y[i];
+                let (mut to, from) = self.row_vectors.as_mut().split_at_col_mut(i);
+                to.as_mut().subcols_mut(kept, 1).copy_from(from.as_ref().subcols(0, 1));
+            }
+            kept += 1;
+        }
+        self.rows.truncate(kept);
+        if kept > 0 {
+            self.update_gram(0);
+        }
+    }
+
+    /// Columns of `G'` for the rows from `first` on, by one backward sweep of all of them together.
+    fn sweep(&mut self, problem: &LqProblem, riccati: &Riccati, first: usize) {
+        let LqSize { states, inputs, stages, .. } = self.size;
+        let total = self.rows.len();
+        self.row_vectors.as_mut().subcols_mut(first, total - first).fill(0.0);
+        // Rows first..active are in the sweep.
+        let mut active = first;
+        let last_stage = self.rows.get(first).map_or(0, |row| row.stage as usize);
+        for k in (0..=last_stage.min(stages)).rev() {
+            let count = active - first;
+            let at = k * inputs;
+            if count > 0 {
+                // λ holds the adjoint at node k+1; k < N here because a row of node N enters below first.
+                let transition = problem.stages[k].transition.as_ref();
+                let (b, a) = (transition.subcols(0, inputs), transition.subcols(inputs, states));
+                let adjoint = self.adjoint.as_ref().subcols(first, count);
+                gemm(
+                    self.projected.as_mut().subcols_mut(first, count),
+                    Accum::Replace,
+                    b.transpose(),
+                    adjoint,
+                    1.0,
+                );
+                let mut next = self.next_adjoint.as_mut().subcols_mut(first, count);
+                gemm(next.as_mut(), Accum::Replace, a.transpose(), adjoint, 1.0);
+                let projected = self.projected.as_ref().subcols(first, count);
+                gemm(next, Accum::Add, riccati.gain(k).transpose(), projected, 1.0);
+                self.row_vectors.as_mut().submatrix_mut(at, first, inputs, count).copy_from(projected);
+                core::mem::swap(&mut self.adjoint, &mut self.next_adjoint);
+            }
+            while active < total && self.rows[active].stage as usize == k {
+                self.row_buffer.fill(0.0);
+                problem.add_row(self.rows[active], 1.0, &mut self.row_buffer);
+                let (f, e) = self.row_buffer.split_at(inputs);
+                let adjoint = self.adjoint.col_as_slice_mut(active);
+                adjoint.copy_from_slice(e);
+                if k < stages {
+                    gemv(adjoint, Accum::Add, riccati.gain(k).transpose(), f, 1.0);
+                    self.row_vectors.col_as_slice_mut(active)[at..at + inputs].copy_from_slice(f);
+                }
+                active += 1;
+            }
+            if k < stages && active > first {
+                let block = self.row_vectors.as_mut().submatrix_mut(at, first, inputs, active - first);
+                solve_lower_triangular_in_place(riccati.input_factor(k), block, Par::Seq);
+            }
+        }
+    }
+
+    /// Slack, norm, upper bound and Gram entries of the rows from `first` on.
+    fn complete_rows(&mut self, problem: &LqProblem, first: usize) {
+        let LqSize { inputs, states, stages, .. } = self.size;
+        for i in first..self.rows.len() {
+            let row = self.rows[i];
+            let stage = row.stage as usize;
+            self.row_buffer.fill(0.0);
+            problem.add_row(row, 1.0, &mut self.row_buffer);
+            let (f, e) = self.row_buffer.split_at(inputs);
+            let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+            let mut value = dot(&e[..states], self.lqr.x.col_as_slice(stage));
+            if stage < stages {
+                value += dot(f, self.lqr.u.col_as_slice(stage));
+            }
+            let column = self.row_vectors.col_as_slice_mut(i);
+            let norm = libm::sqrt(dot(column, column));
+            // A row nothing can change keeps norm 1: its multiplier stays where the box puts it.
+            let norm = if norm > f64::MIN_POSITIVE && norm.is_finite() { norm } else { 1.0 };
+            for entry in column.iter_mut() {
+                *entry /= norm;
+            }
+            self.row_norm[i] = norm;
+            self.slack[i] = (problem.bound(row) - value) / norm;
+            self.upper[i] = problem.tag(row).penalty * norm;
+            self.y[i] = 0.0;
+        }
+        self.update_gram(first);
+    }
+
+    /// Gram entries of the rows from `first` on with all rows.
+    fn update_gram(&mut self, first: usize) {
+        let total = self.rows.len();
+        let vectors = self.row_vectors.as_ref();
+        let new = vectors.subcols(first, total - first);
+        let target = self.gram.as_mut().submatrix_mut(first, 0, total - first, total);
+        gemm(target, Accum::Replace, new.transpose(), vectors.subcols(0, total), 1.0);
+        for row in first..total {
+            for column in 0..row {
+                self.gram[(column, row)] = self.gram[(row, column)];
+            }
+        }
+    }
+
+    /// Solves (D); `false` when there is no usable answer.
+    fn solve_dual(&mut self, backend: &mut dyn QpSolver, report: &mut ProjectedQpReport) -> bool {
+        let total = self.rows.len();
+        let gram = self.gram.as_ref().submatrix(0, 0, total, total);
+        let (slack, upper) = (&self.slack[..total], &self.upper[..total]);
+        report.solves += 1;
+        match backend.solve(gram, slack, upper, &mut self.y[..total]) {
+            Ok(dual) => report.iterations += dual.iterations,
+            Err(_) => {
+                report.backend_failures += 1;
+                match self.spare.solve(gram, slack, upper, &mut self.y[..total]) {
+                    Ok(dual) => report.iterations += dual.iterations,
+                    Err(_) => {
+                        self.y[..total].fill(0.0);
+                        return false;
+                    }
+                }
+            }
+        }
+        true
+    }
+
+    /// `w = -G'y`, `v_k = L_k⁻ᵀ w_k`.
+    fn recover(&mut self, riccati: &Riccati) {
+        let LqSize { inputs, stages, .. } = self.size;
+        let total = self.rows.len();
+        gemv(
+            &mut self.w,
+            Accum::Replace,
+            self.row_vectors.as_ref().subcols(0, total),
+            &self.y[..total],
+            -1.0,
+        );
+        for k in 0..stages {
+            let v = self.v.col_as_slice_mut(k);
+            v.copy_from_slice(&self.w[k * inputs..(k + 1) * inputs]);
+            solve_upper_triangular_in_place(riccati.input_factor(k).transpose(), vector_mut(v), Par::Seq);
+        }
+    }
+}
+
+/// The default backend of this build: Clarabel with the standard library, the active-set method without.
+///
+/// # Errors
+/// [`QpError::Refused`] when Clarabel does not accept its set-up.
+pub fn default_backend(capacity: usize) -> Result<Box<dyn QpSolver + Send>, QpError> {
+    #[cfg(feature = "clarabel")]
+    return Ok(Box::new(crate::clarabel_dual::ClarabelDual::new(capacity, 1e-8)?));
+    #[cfg(not(feature = "clarabel"))]
+    return Ok(Box::new(ActiveSetDual::new(capacity)));
+}

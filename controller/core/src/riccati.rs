@@ -1,0 +1,242 @@
+//! The Riccati recursion of the unconstrained problem, and the forward rollout.
+//!
+//! With `V_k(x) = ½ x' P_k x + p_k' x` the cost-to-go and `z = (u, x)`, one stage backwards is
+//!
+//! ```text
+//! M = [R S; S' Q] + [B A]' P_{k+1} [B A]          m = (r, q) + [B A]' (p_{k+1} + P_{k+1} d)
+//! M = [L 0; Y' 1] [1 0; 0 P_k] [L' Y; 0 1]        H = M_uu = L L',  Y = L⁻¹ M_ux,  y = L⁻¹ m_u
+//! P_k = M_xx - Y' Y     p_k = m_x - Y' y          K = -L⁻ᵀ Y        k = -L⁻ᵀ y
+//! ```
+//!
+//! the leading part of a block Cholesky factorisation: `P_k` comes out symmetric by construction (one triangle is computed and
+//! mirrored). The factors `L` stay for the constrained problem ([`crate::projected_qp`]).
+//!
+//! Completing the square, the cost of `u_k = K_k x_k + k_k + v_k` along the dynamics is `V_0(x_0) + const + ½ Σ v_k' H_k v_k`.
+//!
+//! Cost: O(N (n_u + n_x)³), no allocation after [`Riccati::new`].
+//!
+//! Source: P. Dyer, S. R. McReynolds, *The Computation and Theory of Optimal Control*, 1970; square-root form of the stage:
+//! G. Frison, J. B. Jørgensen, *Efficient implementation of the Riccati recursion*, IEEE CCA 2013.
+
+use alloc::vec;
+use alloc::vec::Vec;
+
+use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
+use faer::{Accum, Mat, MatRef, Par};
+
+use crate::errors::ControlError;
+use crate::kernels::{CholeskyScratch, factor, gemm, gemm_lower, gemv, mirror_lower, vector_mut};
+use crate::lq_problem::{LqProblem, LqSize};
+
+/// Gains, factors and cost-to-go of every stage.
+#[derive(Debug)]
+pub struct Riccati {
+    size: LqSize,
+    /// `P_0 .. P_N`, full symmetric.
+    cost_to_go: Vec<Mat<f64>>,
+    cost_to_go_gradient: Vec<Vec<f64>>,
+    gain: Vec<Mat<f64>>,
+    feed_forward: Vec<Vec<f64>>,
+    /// Lower triangular `L_k`.
+    input_factor: Vec<Mat<f64>>,
+    /// `P [B A]`.
+    propagated: Mat<f64>,
+    /// `M`.
+    stage_hessian: Mat<f64>,
+    stage_gradient: Vec<f64>,
+    shifted: Vec<f64>,
+    scratch: CholeskyScratch,
+}
+
+impl Riccati {
+    /// Room for problems of this size.
+    pub fn new(size: LqSize) -> Self {
+        let LqSize { states, inputs, stages, .. } = size;
+        Self {
+            size,
+            cost_to_go: vec![Mat::zeros(states, states); stages + 1],
+            cost_to_go_gradient: vec![vec![0.0; states]; stages + 1],
+            gain: vec![Mat::zeros(inputs, states); stages],
+            feed_forward: vec![vec![0.0; inputs]; stages],
+            input_factor: vec![Mat::zeros(inputs, inputs); stages],
+            propagated: Mat::zeros(states, inputs + states),
+            stage_hessian: Mat::zeros(inputs + states, inputs + states),
+            stage_gradient: vec![0.0; inputs + states],
+            shifted: vec![0.0; states],
+            scratch: CholeskyScratch::new(inputs),
+        }
+    }
+
+    /// Backward sweep over all stages.
+    ///
+    /// # Errors
+    /// [`ControlError::NotPositiveDefinite`] when `H_k` has no Cholesky factor (or holds a NaN).
+    pub fn factorise(&mut self, problem: &LqProblem) -> Result<(), ControlError> {
+        let last = self.size.stages;
+        self.cost_to_go[last].copy_from(&problem.terminal_hessian);
+        mirror_lower(self.cost_to_go[last].as_mut());
+        self.cost_to_go_gradient[last].copy_from_slice(&problem.terminal_gradient);
+        for stage in (0..last).rev() {
+            self.stage(problem, stage)?;
+        }
+        Ok(())
+    }
+
+    fn stage(&mut self, problem: &LqProblem, k: usize) -> Result<(), ControlError> {
+        let LqSize { states, inputs, .. } = self.size;
+        let stage = &problem.stages[k];
+        let transition = stage.transition.as_ref();
+        let (before, after) = self.cost_to_go.split_at_mut(k + 1);
+        let (cost_to_go, next) = (&mut before[k], &after[0]);
+        gemm(self.propagated.as_mut(), Accum::Replace, next.as_ref(), transition, 1.0);
+        self.stage_hessian.copy_from(&stage.hessian);
+        let whole = self.stage_hessian.as_mut();
+        gemm_lower(whole, Accum::Add, transition.transpose(), self.propagated.as_ref(), 1.0);
+
+        let (mut m_uu, _, mut m_xu, m_xx) = self.stage_hessian.as_mut().split_at_mut(inputs, inputs);
+        factor(m_uu.as_mut(), &mut self.scratch).ok_or(ControlError::NotPositiveDefinite { stage: k })?;
+        let l = m_uu.as_ref();
+        solve_lower_triangular_in_place(l, m_xu.as_mut().transpose_mut(), Par::Seq);
+        let y = m_xu.as_ref();
+
+        cost_to_go.copy_from(m_xx.as_ref());
+        gemm_lower(cost_to_go.as_mut(), Accum::Add, y, y.transpose(), -1.0);
+        mirror_lower(cost_to_go.as_mut());
+
+        let gain = &mut self.gain[k];
+        for column in 0..states {
+            let target = gain.col_as_slice_mut(column);
+            for (row, entry) in target.iter_mut().enumerate() {
+                *entry = -y[(column, row)];
+            }
+        }
+        solve_upper_triangular_in_place(l.transpose(), gain.as_mut(), Par::Seq);
+        let kept = &mut self.input_factor[k];
+        for column in 0..inputs {
+            for row in column..inputs {
+                kept[(row, column)] = l[(row, column)];
+            }
+        }
+        self.gradients(problem, k);
+        Ok(())
+    }
+
+    /// Backward sweep over the linear terms only, with the factors of the last [`Riccati::factorise`]: for another defect,
+    /// gradient or terminal gradient. Cost: O(N n²).
+    pub fn update_gradients(&mut self, problem: &LqProblem) {
+        let last = self.size.stages;
+        self.cost_to_go_gradient[last].copy_from_slice(&problem.terminal_gradient);
+        for stage in (0..last).rev() {
+            self.gradients(problem, stage);
+        }
+    }
+
+    fn gradients(&mut self, problem: &LqProblem, k: usize) {
+        let inputs = self.size.inputs;
+        let stage = &problem.stages[k];
+        self.shifted.copy_from_slice(&self.cost_to_go_gradient[k + 1]);
+        gemv(&mut self.shifted, Accum::Add, self.cost_to_go[k + 1].as_ref(), &stage.defect, 1.0);
+        self.stage_gradient.copy_from_slice(&stage.gradient);
+        gemv(&mut self.stage_gradient, Accum::Add, stage.transition.as_ref().transpose(), &self.shifted, 1.0);
+        let (m_u, m_x) = self.stage_gradient.split_at(inputs);
+        let feed_forward = &mut self.feed_forward[k];
+        for (target, value) in feed_forward.iter_mut().zip(m_u) {
+            *target = -value;
+        }
+        self.cost_to_go_gradient[k].copy_from_slice(m_x);
+        // p = m_x - Y' y = m_x + K' m_u
+        gemv(&mut self.cost_to_go_gradient[k], Accum::Add, self.gain[k].as_ref().transpose(), m_u, 1.0);
+        let l = self.input_factor[k].as_ref();
+        solve_lower_triangular_in_place(l, vector_mut(feed_forward), Par::Seq);
+        solve_upper_triangular_in_place(l.transpose(), vector_mut(feed_forward), Par::Seq);
+    }
+
+    /// `K_k`, `n_u x n_x`.
+    pub fn gain(&self, stage: usize) -> MatRef<'_, f64> {
+        self.gain[stage].as_ref()
+    }
+
+    /// `k_k`.
+    pub fn feed_forward(&self, stage: usize) -> &[f64] {
+        &self.feed_forward[stage]
+    }
+
+    /// Lower triangular `L_k` with `L_k L_k' = H_k`; zeros above the diagonal.
+    pub fn input_factor(&self, stage: usize) -> MatRef<'_, f64> {
+        self.input_factor[stage].as_ref()
+    }
+
+    /// `P_k`, full symmetric.
+    pub fn cost_to_go(&self, stage: usize) -> MatRef<'_, f64> {
+        self.cost_to_go[stage].as_ref()
+    }
+
+    /// `p_k`.
+    pub fn cost_to_go_gradient(&self, stage: usize) -> &[f64] {
+        &self.cost_to_go_gradient[stage]
+    }
+
+    /// Rolls `u = K x + k + v` out from the first column of `trajectory.x`; `v` may be absent. Cost: O(N n²).
+    pub fn rollout(&self, problem: &LqProblem, v: Option<&Mat<f64>>, trajectory: &mut Trajectory) {
+        let LqSize { inputs, states, stages, .. } = self.size;
+        for k in 0..stages {
+            let stage = &problem.stages[k];
+            let u = trajectory.u.col_as_slice_mut(k);
+            u.copy_from_slice(&self.feed_forward[k]);
+            if let Some(v) = v {
+                for (target, value) in u.iter_mut().zip(v.col_as_slice(k)) {
+                    *target += value;
+                }
+            }
+            gemv(u, Accum::Add, self.gain[k].as_ref(), trajectory.x.col_as_slice(k), 1.0);
+            self.advance(stage.transition.as_ref(), &stage.defect, k, trajectory, inputs, states);
+        }
+    }
+
+    fn advance(
+        &self,
+        transition: MatRef<'_, f64>,
+        defect: &[f64],
+        k: usize,
+        trajectory: &mut Trajectory,
+        inputs: usize,
+        states: usize,
+    ) {
+        let (b, a) = (transition.subcols(0, inputs), transition.subcols(inputs, states));
+        let (mut now, mut next) = trajectory.x.as_mut().split_at_col_mut(k + 1);
+        let mut next = next.as_mut().subcols_mut(0, 1);
+        for (row, value) in defect.iter().enumerate() {
+            next[(row, 0)] = *value;
+        }
+        gemm(next.as_mut(), Accum::Add, a, now.as_mut().subcols_mut(k, 1).as_ref(), 1.0);
+        gemm(next, Accum::Add, b, trajectory.u.as_ref().subcols(k, 1), 1.0);
+    }
+}
+
+/// States at the nodes 0..=N and inputs of the stages 0..N, as columns.
+#[derive(Clone, Debug)]
+pub struct Trajectory {
+    /// `n_x x (N + 1)`.
+    pub x: Mat<f64>,
+    /// `n_u x N`.
+    pub u: Mat<f64>,
+}
+
+impl Trajectory {
+    /// Zeros.
+    pub fn new(size: LqSize) -> Self {
+        Self { x: Mat::zeros(size.states, size.stages + 1), u: Mat::zeros(size.inputs, size.stages) }
+    }
+
+    /// Whether every entry is finite.
+    pub fn is_finite(&self) -> bool {
+        let finite = |m: &Mat<f64>| (0..m.ncols()).all(|j| crate::kernels::all_finite(m.col_as_slice(j)));
+        finite(&self.x) && finite(&self.u)
+    }
+
+    /// Copies another trajectory of the same size.
+    pub fn copy_from(&mut self, other: &Self) {
+        self.x.copy_from(&other.x);
+        self.u.copy_from(&other.u);
+    }
+}

@@ -1,0 +1,41 @@
+//! A warm cycle allocates nothing, other than Clarabel: once per solve.
+
+mod atlas;
+
+use std::alloc::System;
+
+use atlas::{WeldedPlant, atlas};
+use delmpc_controller_core::prelude::*;
+use stats_alloc::{INSTRUMENTED_SYSTEM, Region, StatsAlloc};
+
+#[global_allocator]
+static ALLOCATOR: &StatsAlloc<System> = &INSTRUMENTED_SYSTEM;
+
+#[test]
+fn a_warm_cycle_allocates_only_inside_clarabel() {
+    let atlas = atlas();
+    let mut plant = WeldedPlant::new(&atlas);
+    let mut controller = Controller::new(atlas.controller_model(), ControllerConfig::default()).unwrap();
+    let mut solves_seen = 0;
+    for cycle in 0..30 {
+        let mut state = plant.measure();
+        if cycle > 10 {
+            // A jolt: constraints become active.
+            state.velocity[2] += 0.4;
+        }
+        let region = Region::new(ALLOCATOR);
+        let command = *controller.cycle(&state, state.time_ns, &StoppedClock);
+        let change = region.change();
+        let solves = command.report.qp_solves as usize;
+        if cycle > 2 {
+            let count = change.allocations + change.reallocations;
+            assert!(count <= solves, "cycle {cycle}: {count} allocations, {solves} solves");
+            solves_seen += solves;
+        }
+        plant.command = Some(command);
+        for _ in 0..5 {
+            plant.step();
+        }
+    }
+    assert!(solves_seen > 0, "the QP was solved");
+}

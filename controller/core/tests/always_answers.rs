@@ -1,0 +1,112 @@
+//! Whatever comes in, a valid command goes out, and the ladder is climbed back.
+
+mod atlas;
+mod random_problem;
+
+use atlas::{WeldedPlant, atlas};
+use delmpc_controller_core::cycle::reason;
+use delmpc_controller_core::prelude::*;
+use delmpc_messages::{FallbackLevel, PlantState, Verdict};
+use random_problem::Random;
+
+const PERIOD_NS: u64 = 5_000_000;
+
+#[test]
+fn bad_states_are_refused_by_name_and_the_ladder_is_climbed_back() {
+    let atlas = atlas();
+    let mut plant = WeldedPlant::new(&atlas);
+    let n = plant.rate.len();
+    let mut controller = Controller::new(atlas.controller_model(), ControllerConfig::default()).unwrap();
+    let good = plant.measure();
+    let mut cycle = |change: &dyn Fn(&mut PlantState), k: u64, now_after_ns: u64| {
+        let mut state = good;
+        state.time_ns = k * PERIOD_NS;
+        change(&mut state);
+        let command = *controller.cycle(&state, k * PERIOD_NS + now_after_ns, &StoppedClock);
+        command.validate(plant.model.joint_set_hash, n).unwrap();
+        (command.fallback_level().unwrap(), command.reason, command.verdict().unwrap())
+    };
+    let fresh = (FallbackLevel::FreshSolution, 0, Verdict::Ok);
+    assert_eq!(cycle(&|_| {}, 1, 0), fresh);
+    // NaN: 5. The plan of the last cycle serves, then the LQR.
+    assert_eq!(
+        cycle(&|s| s.position[3] = f64::NAN, 2, 0),
+        (FallbackLevel::ShiftedPlan, 5, Verdict::BadState)
+    );
+    assert_eq!(cycle(&|s| s.n_joints = 7, 10, 0).1, 4);
+    assert_eq!(cycle(&|s| s.header.joint_set_hash ^= 1, 11, 0).1, 3);
+    assert_eq!(cycle(&|s| s.base_orientation_w = [1.0; 4], 12, 0).1, 7);
+    assert_eq!(cycle(&|s| s.time_ns = 1, 13, 0).1, reason::STALE);
+    assert_eq!(cycle(&|_| {}, 30, 60_000_000), (FallbackLevel::StaticLqr, reason::STALE, Verdict::BadState));
+    for k in 31..35 {
+        assert_eq!(cycle(&|_| {}, k, 0), (FallbackLevel::StaticLqr, 0, Verdict::Ok));
+    }
+    assert_eq!(cycle(&|_| {}, 35, 0), fresh);
+    // A state from the past, though not too old.
+    assert_eq!(cycle(&|s| s.time_ns -= 2 * PERIOD_NS, 36, 0).1, reason::OUT_OF_ORDER);
+}
+
+#[test]
+fn garbage_gives_finite_commands() {
+    let atlas = atlas();
+    let mut plant = WeldedPlant::new(&atlas);
+    let n = plant.rate.len();
+    let mut controller = Controller::new(atlas.controller_model(), ControllerConfig::default()).unwrap();
+    let good = plant.measure();
+    let mut random = Random::new(77);
+    for k in 1..60u64 {
+        let mut state = good;
+        state.time_ns = k * PERIOD_NS;
+        let size = 10f64.powf(5.0 * random.signed());
+        for i in 0..n {
+            state.position[i] += size * random.signed();
+            state.velocity[i] += size * random.signed();
+        }
+        if k % 5 == 0 {
+            state.velocity[(k % 30) as usize] = [f64::NAN, f64::INFINITY, 1e300][(k % 3) as usize];
+        }
+        let command = controller.cycle(&state, state.time_ns, &StoppedClock);
+        command.validate(plant.model.joint_set_hash, n).unwrap();
+        let limits = plant.model.message_joint.iter().zip(&plant.model.limits);
+        assert!(limits.clone().all(|(&j, limit)| command.torque[j].abs() <= limit.effort));
+    }
+}
+
+#[test]
+fn the_baseline_is_a_fixed_gain_about_the_posture_and_off_is_off() {
+    let atlas = atlas();
+    let mut plant = WeldedPlant::new(&atlas);
+    let state = plant.measure();
+    let with = |kind| {
+        let config = ControllerConfig { kind, ..ControllerConfig::default() };
+        let mut controller = Controller::new(atlas.controller_model(), config).unwrap();
+        *controller.cycle(&state, 0, &StoppedClock)
+    };
+    let lqr = with(ControllerKind::StaticLqr);
+    let (joint, home) = (plant.model.message_joint[0], plant.model.posture[0]);
+    assert_eq!(lqr.position_ref[joint], home);
+    assert!(lqr.gain[joint][joint] < -100.0, "{}", lqr.gain[joint][joint]);
+    let off = with(ControllerKind::Off);
+    assert!(off.torque.iter().all(|u| *u == 0.0) && off.gain.iter().flatten().all(|k| *k == 0.0));
+}
+
+#[test]
+fn models_and_configurations_that_make_no_sense_are_refused() {
+    let atlas = atlas();
+    let refused = |change: &dyn Fn(&mut ControllerModel, &mut ControllerConfig)| {
+        let (mut model, mut config) = (atlas.controller_model(), ControllerConfig::default());
+        change(&mut model, &mut config);
+        Controller::new(model, config).is_err()
+    };
+    assert!(refused(&|m, _| m.posture[4] = f64::NAN));
+    assert!(refused(&|m, _| m.message_joint[0] = m.message_joint[1]));
+    assert!(refused(&|m, _| drop(m.limits.pop())));
+    assert!(refused(&|m, _| m.limits[2].effort = 0.0));
+    assert!(refused(&|m, _| m.sole.truncate(2)));
+    assert!(refused(&|_, c| c.period_s = 0.0));
+    assert!(refused(&|_, c| c.stages.clear()));
+    assert!(refused(&|_, c| c.weights.torque = -1.0));
+    assert!(refused(&|_, c| c.weights.com[0] = f64::NAN));
+    assert!(refused(&|_, c| c.qp.capacity = 0));
+    assert!(!refused(&|_, _| {}));
+}

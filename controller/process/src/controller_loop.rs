@@ -1,0 +1,220 @@
+//! The loop of the controller process.
+//!
+//! | clock | one turn |
+//! |---|---|
+//! | realtime | wait for the tick, take the latest state, cycle, send |
+//! | lockstep | wait for the next state, cycle, send |
+//!
+//! The first state is sent by a plant that waits for its answer: that is how both know of each other. In real time, cycles follow each
+//! other tick by tick from the second state on, whether a new state came or not.
+
+use std::thread::sleep;
+use std::time::Duration;
+
+use delmpc_messages::{Command, PlantState, ProcessState, status};
+use delmpc_scenario::{Clock, Scenario};
+use delmpc_transport::{LinkError, Publisher, Subscriber};
+
+use crate::clock::{Ticker, monotonic_ns};
+use crate::figures::{CycleFigure, CycleFigures};
+use crate::membership::{Attendance, Order};
+
+/// What computes a command from a state.
+pub trait Controller {
+    /// One control cycle. Fills in all of `command` but its header and which state it answers. `now_ns` is the present time by
+    /// the plant's clock.
+    fn cycle(&mut self, state: &PlantState, now_ns: u64, command: &mut Command);
+}
+
+/// How a loop ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ending {
+    /// All is done.
+    Finished,
+    /// Something else came first.
+    Ordered(Order),
+}
+
+/// Sleep while there is nothing to do. Short against a cycle, long against the cost of looking.
+const PAUSE: Duration = Duration::from_micros(50);
+
+/// The loop and its ends of the links.
+#[derive(Debug)]
+pub struct ControllerLoop<'a, S, P> {
+    scenario: &'a Scenario,
+    states: S,
+    commands: P,
+    /// The latest state; sequence 0: none yet.
+    state: Box<PlantState>,
+    command: Box<Command>,
+    /// Age of a measurement when it is sent.
+    delay_ns: u64,
+    /// Counts the heap allocations of this process so far.
+    allocations: Option<fn() -> u64>,
+    figures: CycleFigures,
+}
+
+impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S, P> {
+    /// A loop for a scenario. `blank` is a command with run, joint set and joint count filled in.
+    pub fn new(scenario: &'a Scenario, states: S, commands: P, blank: &Command) -> Self {
+        // Half as much again as the run needs: states may be slow to come.
+        let cycles = 1.5 * scenario.duration_s * scenario.controller.mpc_rate_hz;
+        Self {
+            scenario,
+            states,
+            commands,
+            state: Box::new(PlantState::new(0, 0, 0)),
+            command: Box::new(*blank),
+            delay_ns: (scenario.sensors.delay_s * 1e9).round() as u64,
+            allocations: None,
+            figures: CycleFigures::with_capacity(cycles as usize + 1000),
+        }
+    }
+
+    /// Counts the heap allocations of every cycle, by a function that counts those of the process so far.
+    #[must_use]
+    pub fn counting(mut self, allocations: fn() -> u64) -> Self {
+        self.allocations = Some(allocations);
+        self
+    }
+
+    /// Runs to the end.
+    ///
+    /// # Errors
+    /// When a link breaks.
+    pub fn run(
+        mut self,
+        controller: &mut impl Controller,
+        membership: &mut impl Attendance,
+    ) -> Result<(Ending, CycleFigures), LinkError> {
+        let ending = match self.scenario.clock {
+            Clock::Realtime => self.run_by_the_clock(controller, membership)?,
+            Clock::Lockstep => self.run_state_by_state(controller, membership)?,
+        };
+        membership.announce(ProcessState::Finished)?;
+        Ok((ending, self.figures))
+    }
+
+    fn run_by_the_clock(
+        &mut self,
+        controller: &mut impl Controller,
+        membership: &mut impl Attendance,
+    ) -> Result<Ending, LinkError> {
+        let period_ns = (1e9 / self.scenario.controller.mpc_rate_hz).round() as u64;
+        let mut ticker = Ticker::new(monotonic_ns() + period_ns, period_ns);
+        let mut running = false;
+        loop {
+            let tick = ticker.wait();
+            let order = membership.attend()?;
+            if order.ends() {
+                return Ok(Ending::Ordered(order));
+            }
+            let news = self.receive()?;
+            if self.plant_is_done() {
+                return Ok(Ending::Finished);
+            }
+            running |= self.state.header.sequence > 1;
+            if !news && !running {
+                self.commands.serve_newcomers()?;
+                continue;
+            }
+            let sent_ns = self.cycle(controller, tick.due_ns)?;
+            if running {
+                let missed = u64::from(sent_ns > tick.due_ns + period_ns);
+                self.figures.deadline_misses += missed + tick.missed;
+            } else {
+                self.first_answer_given(membership)?;
+            }
+        }
+    }
+
+    fn run_state_by_state(
+        &mut self,
+        controller: &mut impl Controller,
+        membership: &mut impl Attendance,
+    ) -> Result<Ending, LinkError> {
+        loop {
+            let order = membership.attend()?;
+            if order.ends() {
+                return Ok(Ending::Ordered(order));
+            }
+            if !self.receive()? {
+                self.commands.serve_newcomers()?;
+                sleep(PAUSE);
+                continue;
+            }
+            if self.plant_is_done() {
+                return Ok(Ending::Finished);
+            }
+            self.cycle(controller, 0)?;
+            if self.state.header.sequence == 1 {
+                membership.announce(ProcessState::Ready)?;
+            }
+        }
+    }
+
+    /// Takes the latest state; says whether it is a new one.
+    fn receive(&mut self) -> Result<bool, LinkError> {
+        match self.states.receive_latest()? {
+            Some(state) => {
+                *self.state = *state;
+                Ok(true)
+            }
+            None => Ok(false),
+        }
+    }
+
+    fn plant_is_done(&self) -> bool {
+        self.state.has_status(status::FINISHED)
+    }
+
+    fn first_answer_given(&mut self, membership: &mut impl Attendance) -> Result<(), LinkError> {
+        // What the first cycles cost is not what a cycle costs.
+        self.figures = CycleFigures::with_capacity(self.figures.capacity());
+        membership.announce(ProcessState::Ready)
+    }
+
+    /// One cycle; returns when its command was sent. In lockstep nothing that depends on a clock enters the command.
+    fn cycle(&mut self, controller: &mut impl Controller, due_ns: u64) -> Result<u64, LinkError> {
+        let realtime = self.scenario.clock == Clock::Realtime;
+        let begin_ns = monotonic_ns();
+        let measured_ns = self.state.header.sent_at_ns;
+        // The plant's clock runs with ours; a state says what it showed when it was measured, and is sent `delay_s` later.
+        let age_ns = if realtime { begin_ns.saturating_sub(measured_ns) } else { 0 };
+        let command = self.command.as_mut();
+        let before = self.allocations.map_or(0, |count| count());
+        controller.cycle(&self.state, self.state.time_ns + self.delay_ns + age_ns, command);
+
+        let after = self.allocations.map_or(0, |count| count());
+        command.report.allocations = (after - before) as u32;
+        address(command, &self.state);
+        let computed_ns = monotonic_ns();
+        if realtime {
+            command.report.total_ns = computed_ns - begin_ns;
+            command.header.sent_at_ns = computed_ns;
+        }
+        self.commands.send(command)?;
+        let sent_ns = monotonic_ns();
+        let figure = CycleFigure {
+            total_ns: computed_ns - if realtime { due_ns.min(begin_ns) } else { begin_ns },
+            linearize_ns: command.report.linearize_ns,
+            riccati_ns: command.report.riccati_ns,
+            qp_ns: command.report.qp_ns,
+            age_ns: if realtime { sent_ns.saturating_sub(measured_ns) } else { 0 },
+        };
+        self.figures.add(command, figure);
+        command.report.publish_ns = if realtime { sent_ns - computed_ns } else { 0 };
+        Ok(sent_ns)
+    }
+}
+
+
+/// Says which state a command answers, and numbers it.
+pub fn address(command: &mut Command, state: &PlantState) {
+    command.header.sequence += 1;
+    command.state_sequence = state.header.sequence;
+    if state.header.sequence <= 1 {
+        // The plant that waits for its first answer has had commands before, as far as the robot is concerned.
+        command.valid_from_ns = state.time_ns;
+    }
+}

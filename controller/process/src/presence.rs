@@ -1,0 +1,119 @@
+//! Signs of life: giving our own, following those of others.
+
+use delmpc_messages::{Heartbeat, ProcessState, Role};
+use delmpc_transport::{
+    Channel, LinkError, Publisher, RunNode, SharedPublisher, SharedSubscriber, Subscriber,
+};
+
+use crate::clock::monotonic_ns;
+
+/// Time between signs of life.
+const PERIOD_NS: u64 = 20_000_000;
+
+/// Our own signs of life. They come from the loop that does the work, so that a loop that hangs falls silent.
+#[derive(Debug)]
+pub struct Presence {
+    publisher: SharedPublisher<Heartbeat>,
+    heartbeat: Heartbeat,
+}
+
+impl Presence {
+    /// Announces a process that is starting.
+    ///
+    /// # Errors
+    /// When the channel cannot be opened, for example since a living process plays this role.
+    pub fn new(node: &RunNode, joint_set_hash: u64, role: Role) -> Result<Self, LinkError> {
+        let publisher = node.publisher(Channel::Heartbeat(role))?;
+        let heartbeat = Heartbeat::new(node.run().0, joint_set_hash, role, std::process::id());
+        let mut presence = Self { publisher, heartbeat };
+        presence.send()?;
+        Ok(presence)
+    }
+
+    /// Gives a sign of life if the last one is old enough. Cheap: call it in every turn of the loop.
+    ///
+    /// # Errors
+    /// When the channel is broken.
+    pub fn beat(&mut self) -> Result<(), LinkError> {
+        match monotonic_ns() >= self.heartbeat.time_ns + PERIOD_NS {
+            true => self.send(),
+            false => Ok(()),
+        }
+    }
+
+    /// Announces a change of state at once.
+    ///
+    /// # Errors
+    /// When the channel is broken.
+    pub fn announce(&mut self, state: ProcessState) -> Result<(), LinkError> {
+        if self.heartbeat.state == state as u32 {
+            return self.beat();
+        }
+        self.heartbeat.state = state as u32;
+        self.send()
+    }
+
+    fn send(&mut self) -> Result<(), LinkError> {
+        self.heartbeat.header.sequence += 1;
+        self.heartbeat.time_ns = monotonic_ns();
+        self.heartbeat.header.sent_at_ns = self.heartbeat.time_ns;
+        self.publisher.send(&self.heartbeat)
+    }
+}
+
+/// Time between two looks that counts as silence at most: longer, it was us who slept.
+const LONGEST_LOOK_NS: u64 = 200_000_000;
+
+/// What another process says of itself.
+#[derive(Debug)]
+pub struct Peer {
+    subscriber: SharedSubscriber<Heartbeat>,
+    latest: Option<Heartbeat>,
+    looked_ns: u64,
+    silent_ns: u64,
+}
+
+impl Peer {
+    /// Follows the process that plays `role`.
+    ///
+    /// # Errors
+    /// When the channel cannot be opened.
+    pub fn new(node: &RunNode, role: Role) -> Result<Self, LinkError> {
+        let subscriber = node.subscriber(Channel::Heartbeat(role))?;
+        Ok(Self { subscriber, latest: None, looked_ns: monotonic_ns(), silent_ns: 0 })
+    }
+
+    /// Takes in what is new. A sign of life that cannot be understood counts as none.
+    ///
+    /// # Errors
+    /// When the channel is broken.
+    pub fn listen(&mut self) -> Result<(), LinkError> {
+        let now = monotonic_ns();
+        self.silent_ns += (now - self.looked_ns).min(LONGEST_LOOK_NS);
+        self.looked_ns = now;
+        if let Some(heartbeat) = self.subscriber.receive_latest()? {
+            let sequence = heartbeat.header.sequence;
+            let news = self.latest.is_none_or(|latest| latest.header.sequence != sequence);
+            if news && heartbeat.validate(heartbeat.header.joint_set_hash).is_ok() {
+                self.latest = Some(*heartbeat);
+                self.silent_ns = 0;
+            }
+        }
+        Ok(())
+    }
+
+    /// How long it has been silent, as far as we were awake to hear it (s).
+    pub fn silent_s(&self) -> f64 {
+        self.silent_ns as f64 * 1e-9
+    }
+
+    /// The state it announced last, if it was ever heard.
+    pub fn state(&self) -> Option<ProcessState> {
+        self.latest.and_then(|heartbeat| heartbeat.state())
+    }
+
+    /// Its process id, if it was ever heard.
+    pub fn pid(&self) -> Option<u32> {
+        self.latest.map(|heartbeat| heartbeat.pid)
+    }
+}

@@ -1,0 +1,867 @@
+//! One step of a robot on unilateral frictional ground: the Simpson step with contact impulses held over it.
+//!
+//! | letter | meaning |
+//! |---|---|
+//! | `φ`, `φ̂` | gap of a contact at the start; gap that would be left if its force brought the normal velocity to 0 by the end |
+//! | `v_n0`, `v*` | normal velocity at the start; its target at the end |
+//! | `λ` | impulses of the step; row `α` of the equations of motion gets `w_α G(q^α)ᵀ λ`, as a force held over the step |
+//! | `y`, `W` | velocities of the contacts at the end, `y = G(q^s) M⁻¹ p_{k+1}`; their response `∂y/∂λ` ([`LoadResponse`]) |
+//!
+//! ```text
+//! 1 candidates: φ + 2 Δt min(v_n0, 0) - 2 g Δt² < margin;  none -> the plain step
+//! 2 φ̂ = φ + (Δt/2) v_n0;   v* = -φ̂/Δt for φ̂ >= 0 (landing without penetration or rebound), min(-β φ̂/Δt, v_rec) for φ̂ < 0
+//! 3 λ := impulses of the last step (0 for contacts that were no candidates)
+//! 4 Newton on the DEL equations with λ fixed
+//! 5 y, W;  c = y - W λ - v* e_n;  the contact law ([`crate::contact_law`]) gives λ_new
+//! 6 stop if |W (λ_new - λ)| <= 1e-7 (|W λ_new| + g Δt);  λ := λ_new;  go to 4 (at most 8 rounds)
+//! ```
+//!
+//! The state `p` is the physical momentum at every boundary, rest is exact inside the step, and no contact mode is named beforehand.
+//! Gains above `1/Δt` on `φ̂` would flip the sign of the gap in every step; above `v_rec` the correction throws the body off the ground.
+//!
+//! What is reused: the nodes of the last step (extrapolated); factors and `W` for up to 20 steps with the same candidates, unless an
+//! impact happens or Newton's method contracts worse than 0.02; between rounds the nodes are moved by `X (λ_new - λ)`. None of it
+//! changes the solution, which the iteration alone decides.
+//!
+//! Source: ours, measured against impulse-at-the-start formulations. The cone law on velocities is J. J. Moreau, *Unilateral
+//! contact and dry friction in finite freedom dynamics*, 1988.
+
+use delmpc_mechanics::branch_lu::BranchLu;
+use delmpc_mechanics::del_residual::{DelWorkspace, ForceCapacity};
+use delmpc_mechanics::errors::{ModelError, StepError};
+use delmpc_mechanics::forces::{PointForce, StepForces};
+use delmpc_mechanics::load_response::{BoundaryMotion, LoadPoint, LoadResponse};
+use delmpc_mechanics::lobatto::LobattoRule;
+use delmpc_mechanics::newton_direction::NewtonDirection;
+use delmpc_mechanics::spatial::{Wrench, exp_rotation};
+use delmpc_mechanics::state::State;
+use delmpc_mechanics::tree::{JointKind, KinematicTree};
+use nalgebra::{Matrix3, Vector3};
+
+use crate::contact_law::{ContactLaw, ContactProblem, LawPath, LawReport, Regularisation};
+use crate::dense::largest;
+use crate::error::{PlantError, require, require_length};
+use crate::terrain::Terrain;
+
+/// The next change of the nodes is predicted below this (times `1 + max|q|`): converged.
+const PREDICTED_CHANGE: f64 = 1e-14;
+/// A change below this (times `1 + max|q|`) is converged without prediction.
+const SMALL_CHANGE: f64 = 1e-13;
+/// A change below this (times `1 + max|q|`) is round-off: the nodes stay as they were evaluated.
+const NO_CHANGE: f64 = 1e-15;
+/// Below this the iteration may stop when it no longer shrinks.
+const STAGNATION_CHANGE: f64 = 1e-9;
+/// Contraction above which the Newton matrix is renewed.
+const RENEW_CONTRACTION: f64 = 0.1;
+/// Newton iterations per round after which a step fails.
+const MAX_ITERATIONS: usize = 30;
+/// A revolute joint that ends further (rad) from its guess is a spurious solution.
+const TURN_LIMIT: f64 = 1.0;
+/// Reach of the candidate test, m.
+const CANDIDATE_MARGIN: f64 = 1e-4;
+/// Rounds of a step after which factors and `W` are computed again.
+const ROUNDS_PER_RESPONSE: usize = 4;
+/// Change of the velocities, relative, after which they are: an impact.
+const LARGE_CHANGE: f64 = 0.2;
+/// Steps after which they are.
+const MAX_FACTOR_AGE: usize = 20;
+/// Contraction of Newton's method in a step after which they are for the next one.
+const AGED_CONTRACTION: f64 = 0.02;
+
+/// A point of the robot that may touch the ground.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ContactPoint {
+    /// Body index.
+    pub body: usize,
+    /// Point in the body's link frame, m.
+    pub point: Vector3<f64>,
+    /// Friction coefficient of point and ground.
+    pub friction: f64,
+}
+
+/// What is fixed when a [`ContactStep`] is made.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ContactOptions {
+    /// Unknown nodes per step: 2 is Simpson's rule.
+    pub unknown_nodes: usize,
+    /// `β`: share of a penetration that is removed in a step.
+    pub correction: f64,
+    /// Regularisation of the impulses.
+    pub regularisation: Regularisation,
+    /// Rounds of Newton's method and contact law.
+    pub max_rounds: usize,
+    /// Change of the velocities, relative, at which the rounds end.
+    pub tolerance: f64,
+    /// Most contacts that may touch at the same time; beyond it the deepest ones count.
+    pub max_candidates: usize,
+    /// Most point forces (pushes) in a step.
+    pub max_pushes: usize,
+}
+
+impl Default for ContactOptions {
+    fn default() -> Self {
+        Self {
+            unknown_nodes: 2,
+            correction: 0.1,
+            regularisation: Regularisation::default(),
+            max_rounds: 8,
+            tolerance: 1e-7,
+            max_candidates: 16,
+            max_pushes: 4,
+        }
+    }
+}
+
+/// What happened at one contact in the last step.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ContactResult {
+    /// Whether the contact took part in the contact law.
+    pub candidate: bool,
+    /// Whether it carries load: normal impulse above `1e-6 m g Δt`.
+    pub touching: bool,
+    /// Gap at the start, m; infinite without ground.
+    pub gap: f64,
+    /// Rows: tangents and normal of the ground, in {0}.
+    pub frame: Matrix3<f64>,
+    /// Impulse of the ground on the robot, in {0}, N·s.
+    pub impulse_w: Vector3<f64>,
+    /// Its normal part, N·s.
+    pub normal_impulse: f64,
+    /// `Σ_α w_α x^α`: where the impulse acts in the balance of momentum, m.
+    pub mean_point_w: Vector3<f64>,
+    /// Place of the point at the start and at the end, in {0}, m.
+    pub start_w: Vector3<f64>,
+    /// Place at the end, m.
+    pub end_w: Vector3<f64>,
+    /// Velocity at the end of the step, in {0}, m/s.
+    pub velocity_w: Vector3<f64>,
+}
+
+/// What a step took.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ContactReport {
+    /// Contacts in the contact law.
+    pub candidates: usize,
+    /// Rounds of Newton's method and contact law (1 without candidates).
+    pub rounds: usize,
+    /// Newton iterations in all.
+    pub iterations: usize,
+    /// Factorisations of the Newton matrix.
+    pub factorizations: usize,
+    /// Rounds in which all contacts stuck.
+    pub stick_solves: u32,
+    /// Rounds solved by Newton's method on the law.
+    pub newton_solves: u32,
+    /// Cone programs solved.
+    pub cone_solves: u32,
+    /// Interior-point iterations in all.
+    pub cone_iterations: u32,
+    /// Residual of the contact law of the last round, relative.
+    pub law_residual: f64,
+    /// Largest change of a contact velocity the last round still wanted, m/s.
+    pub velocity_change: f64,
+    /// Whether rounds and law converged. If not, the last iterate was kept.
+    pub converged: bool,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Candidate {
+    contact: usize,
+    gap: f64,
+    target: f64,
+}
+
+/// The integrator of a robot with contacts, with all its memory.
+#[derive(Debug)]
+pub struct ContactStep {
+    options: ContactOptions,
+    time_step: f64,
+    gravity: f64,
+    weight: f64,
+    terrain: Terrain,
+    contacts: Vec<ContactPoint>,
+    points: Vec<LoadPoint>,
+    results: Vec<ContactResult>,
+    del: DelWorkspace,
+    solver: BranchLu,
+    response: LoadResponse,
+    law: ContactLaw,
+    start: BoundaryMotion,
+    end: BoundaryMotion,
+    next: State,
+    has_previous: bool,
+    previous_nodes: Vec<f64>,
+    extrapolation: Vec<f64>,
+    guessed_end: Vec<f64>,
+    direction: Vec<f64>,
+    /// Contraction seen with the present factors in this step.
+    contraction: f64,
+    /// Steps since the factorisation.
+    factor_age: usize,
+    /// Contacts `W` was computed for with the present factors; empty for none.
+    response_of: Vec<usize>,
+    candidates: Vec<Candidate>,
+    loads: Vec<LoadPoint>,
+    forces: Vec<PointForce>,
+    response_w: Vec<f64>,
+    response_c: Vec<f64>,
+    free_velocity: Vec<f64>,
+    end_velocity: Vec<f64>,
+    friction: Vec<f64>,
+    last_impulse: Vec<f64>,
+    impulse: Vec<f64>,
+    new_impulse: Vec<f64>,
+    scratch: Vec<f64>,
+}
+
+impl ContactStep {
+    /// For steps of `time_step` (s) of `tree` on `terrain`.
+    ///
+    /// # Errors
+    /// [`PlantError`] for a number out of range, a contact on a body that does not exist, or a model the integrator refuses.
+    pub fn new(
+        tree: &KinematicTree,
+        time_step: f64,
+        contacts: &[ContactPoint],
+        terrain: Terrain,
+        options: ContactOptions,
+    ) -> Result<Self, PlantError> {
+        check(tree, contacts, &options)?;
+        let rule = LobattoRule::new(options.unknown_nodes)?;
+        let capacity = options.max_candidates.min(contacts.len()).max(1);
+        let force_capacity = ForceCapacity { points: capacity + options.max_pushes, laws: false };
+        let del = DelWorkspace::new(tree, &rule, time_step, force_capacity)?;
+        let solver = BranchLu::new(tree, &del);
+        let nodes = rule.nodes().len();
+        let extrapolation = rule
+            .nodes()
+            .iter()
+            .flat_map(|c| (0..nodes).map(|beta| rule.lagrange(beta, 1.0 + c)).collect::<Vec<_>>())
+            .collect();
+        let points = contacts
+            .iter()
+            .map(|contact| LoadPoint {
+                body: contact.body,
+                point_b: contact.point - tree.bodies()[contact.body].inertia.com,
+            })
+            .collect();
+        let (dof, n) = (tree.dof(), 3 * capacity);
+        Ok(Self {
+            options,
+            time_step,
+            gravity: tree.gravity_w().norm(),
+            weight: tree.gravity_w().norm() * tree.total_mass(),
+            terrain,
+            contacts: contacts.to_vec(),
+            points,
+            results: vec![ContactResult::default(); contacts.len()],
+            response: LoadResponse::new(tree, &del, &solver, capacity),
+            law: ContactLaw::new(capacity, options.regularisation)?,
+            start: BoundaryMotion::new(tree),
+            end: BoundaryMotion::new(tree),
+            next: State::zeros(tree),
+            has_previous: false,
+            previous_nodes: vec![0.0; nodes * dof],
+            extrapolation,
+            guessed_end: vec![0.0; dof],
+            direction: vec![0.0; options.unknown_nodes * dof],
+            contraction: 1.0,
+            factor_age: MAX_FACTOR_AGE,
+            response_of: Vec::with_capacity(capacity),
+            candidates: Vec::with_capacity(contacts.len()),
+            loads: Vec::with_capacity(capacity),
+            forces: Vec::with_capacity(capacity + options.max_pushes),
+            response_w: vec![0.0; n * n],
+            response_c: vec![0.0; n * n],
+            free_velocity: vec![0.0; n],
+            end_velocity: vec![0.0; n],
+            friction: vec![0.0; capacity],
+            last_impulse: vec![0.0; n],
+            impulse: vec![0.0; n],
+            new_impulse: vec![0.0; n],
+            scratch: vec![0.0; n],
+            del,
+            solver,
+        })
+    }
+
+    /// Advances `state` by one step. On an error the state is untouched. Allocates only inside Clarabel.
+    ///
+    /// `joint_forces` are held over the step, `pushes` are forces from outside.
+    ///
+    /// # Errors
+    /// [`StepError`] of the integrator: not converged, singular, input not finite, spurious solution, wrong lengths.
+    pub fn step(
+        &mut self,
+        tree: &KinematicTree,
+        state: &mut State,
+        joint_forces: &[f64],
+        pushes: &[PointForce],
+    ) -> Result<ContactReport, StepError> {
+        let report = self.solve(tree, state, joint_forces, pushes)?;
+        state.copy_from(&self.next);
+        Ok(report)
+    }
+
+    /// Solves the step from `state` without advancing it: [`ContactStep::next_state`] and [`ContactStep::results`] hold the outcome.
+    ///
+    /// # Errors
+    /// As [`ContactStep::step`].
+    pub fn solve(
+        &mut self,
+        tree: &KinematicTree,
+        state: &State,
+        joint_forces: &[f64],
+        pushes: &[PointForce],
+    ) -> Result<ContactReport, StepError> {
+        if pushes.len() > self.options.max_pushes {
+            let (got, expected) = (pushes.len(), self.options.max_pushes);
+            return Err(ModelError::Length { quantity: "pushes", got, expected }.into());
+        }
+        let continues = self.has_previous && *state == self.next;
+        self.has_previous = false;
+        if continues {
+            core::mem::swap(&mut self.start, &mut self.end);
+        } else {
+            self.start.update(tree, state)?;
+        }
+        self.find_candidates();
+        self.load_impulses();
+        self.set_forces(pushes);
+        let forces = StepForces::held(joint_forces).with_points(&self.forces);
+        self.del.begin(tree, state, &forces)?;
+        let mut report = ContactReport { candidates: self.candidates.len(), ..ContactReport::default() };
+        self.contraction = 1.0;
+        self.factor_age = if continues { self.factor_age + 1 } else { MAX_FACTOR_AGE };
+        self.first_newton(tree, state, continues, &mut report)?;
+        if self.contraction > AGED_CONTRACTION && self.contraction < 1.0 {
+            self.factor_age = MAX_FACTOR_AGE;
+        }
+        if self.candidates.is_empty() {
+            report.rounds = 1;
+            report.converged = true;
+            self.finish_nodes(tree)?;
+        } else {
+            self.rounds(tree, pushes.len(), &mut report)?;
+        }
+        self.keep(tree);
+        Ok(report)
+    }
+
+    /// Forgets the last step and all impulses: the next one starts from the velocity.
+    pub fn forget(&mut self) {
+        self.has_previous = false;
+        self.response_of.clear();
+        self.factor_age = MAX_FACTOR_AGE;
+        self.results.fill(ContactResult::default());
+    }
+
+    /// Sets the impulses (in {0}, N·s) that stand for those of the last step.
+    ///
+    /// # Errors
+    /// [`PlantError::Shape`] unless there is one per contact.
+    pub fn set_last_impulses(&mut self, impulses_w: &[Vector3<f64>]) -> Result<(), PlantError> {
+        require_length("contact impulses", impulses_w.len(), self.contacts.len())?;
+        for (result, impulse) in self.results.iter_mut().zip(impulses_w) {
+            result.candidate = true;
+            result.impulse_w = *impulse;
+        }
+        Ok(())
+    }
+
+    /// Changes the friction coefficient of a contact.
+    ///
+    /// # Errors
+    /// [`PlantError`] for a negative coefficient or a contact that does not exist.
+    pub fn set_friction(&mut self, contact: usize, friction: f64) -> Result<(), PlantError> {
+        check_friction(friction)?;
+        let expected = self.contacts.len();
+        let point = self.contacts.get_mut(contact).ok_or(PlantError::Shape {
+            quantity: "contact",
+            got: contact,
+            expected,
+        })?;
+        point.friction = friction;
+        Ok(())
+    }
+
+    /// The contact points.
+    pub fn contacts(&self) -> &[ContactPoint] {
+        &self.contacts
+    }
+
+    /// The ground.
+    pub fn terrain(&self) -> &Terrain {
+        &self.terrain
+    }
+
+    /// What happened at every contact in the last step.
+    pub fn results(&self) -> &[ContactResult] {
+        &self.results
+    }
+
+    /// State at the end of the last solved step.
+    pub fn next_state(&self) -> &State {
+        &self.next
+    }
+
+    /// Poses and velocities at the end of the last solved step.
+    pub fn end_motion(&self) -> &BoundaryMotion {
+        &self.end
+    }
+
+    /// The nodes of the last solved step.
+    pub fn del(&self) -> &DelWorkspace {
+        &self.del
+    }
+
+    /// Time step, s.
+    pub fn time_step(&self) -> f64 {
+        self.time_step
+    }
+
+    /// `W` of the last step, row-major, contact frames, candidates only.
+    pub fn response(&self) -> &[f64] {
+        let n = 3 * self.candidates.len();
+        &self.response_c[..n * n]
+    }
+
+    /// Contact index of every candidate of the last step, in the order of the rows of [`ContactStep::response`].
+    pub fn candidates(&self) -> impl Iterator<Item = usize> + '_ {
+        self.candidates.iter().map(|candidate| candidate.contact)
+    }
+
+    /// Wrench of the contacts with the given indices over the last step about the origin of {0}, N·m and N.
+    pub fn wrench_w(&self, contacts: &[usize]) -> Wrench {
+        let mut wrench = Wrench::default();
+        for result in contacts.iter().filter_map(|&i| self.results.get(i)) {
+            let force = result.impulse_w / self.time_step;
+            wrench += Wrench::new(result.mean_point_w.cross(&force), force);
+        }
+        wrench
+    }
+
+    fn find_candidates(&mut self) {
+        let (dt, g) = (self.time_step, self.gravity);
+        let recovery = 0.5 * g * dt / self.options.correction;
+        self.candidates.clear();
+        for (contact, (point, result)) in self.points.iter().zip(&mut self.results).enumerate() {
+            let x = self.start.point_w(point);
+            result.start_w = x;
+            let was_candidate = result.candidate;
+            result.candidate = false;
+            let Some(surface) = self.terrain.surface(&x) else {
+                result.gap = f64::INFINITY;
+                result.impulse_w = Vector3::zeros();
+                continue;
+            };
+            let velocity = surface.frame * self.start.velocity_at_w(point.body, &x);
+            if surface.frame != result.frame {
+                self.response_of.clear();
+            }
+            (result.gap, result.frame) = (surface.gap, surface.frame);
+            let reach = surface.gap + 2.0 * dt * velocity.z.min(0.0) - 2.0 * g * dt * dt;
+            if !was_candidate || reach >= CANDIDATE_MARGIN {
+                result.impulse_w = Vector3::zeros();
+            }
+            if reach < CANDIDATE_MARGIN {
+                let left = surface.gap + 0.5 * dt * velocity.z;
+                let target = if left >= 0.0 {
+                    -left / dt
+                } else {
+                    (-self.options.correction * left / dt).min(recovery)
+                };
+                result.candidate = true;
+                self.candidates.push(Candidate { contact, gap: surface.gap, target });
+            }
+        }
+        let capacity = self.friction.len();
+        if self.candidates.len() > capacity {
+            self.candidates.sort_unstable_by(|a, b| a.gap.total_cmp(&b.gap).then(a.contact.cmp(&b.contact)));
+            for left_out in &self.candidates[capacity..] {
+                self.results[left_out.contact].candidate = false;
+                self.results[left_out.contact].impulse_w = Vector3::zeros();
+            }
+            self.candidates.truncate(capacity);
+            self.candidates.sort_unstable_by_key(|candidate| candidate.contact);
+        }
+    }
+
+    /// Impulses of the last step, in the contact frames, and friction of the candidates.
+    fn load_impulses(&mut self) {
+        self.loads.clear();
+        for (i, candidate) in self.candidates.iter().enumerate() {
+            let result = &self.results[candidate.contact];
+            let impulse = result.frame * result.impulse_w;
+            self.last_impulse[3 * i..3 * i + 3].copy_from_slice(impulse.as_slice());
+            self.impulse[3 * i..3 * i + 3].copy_from_slice(impulse.as_slice());
+            self.friction[i] = self.contacts[candidate.contact].friction;
+            self.loads.push(self.points[candidate.contact]);
+        }
+    }
+
+    fn impulse_w(&self, i: usize) -> Vector3<f64> {
+        let frame = &self.results[self.candidates[i].contact].frame;
+        frame.tr_mul(&Vector3::from_column_slice(&self.impulse[3 * i..3 * i + 3]))
+    }
+
+    fn set_forces(&mut self, pushes: &[PointForce]) {
+        self.forces.clear();
+        self.forces.extend_from_slice(pushes);
+        for i in 0..self.candidates.len() {
+            let LoadPoint { body, point_b } = self.loads[i];
+            self.forces.push(PointForce { body, point_b, force_w: self.impulse_w(i) / self.time_step });
+        }
+    }
+
+    fn rounds(
+        &mut self,
+        tree: &KinematicTree,
+        pushes: usize,
+        report: &mut ContactReport,
+    ) -> Result<(), StepError> {
+        let n = 3 * self.candidates.len();
+        let mut rounds_left = ROUNDS_PER_RESPONSE;
+        loop {
+            self.finish_nodes(tree)?;
+            report.rounds += 1;
+            if !self.response_is_current() {
+                self.update_response(tree)?;
+            }
+            let law = self.solve_law();
+            match law.path {
+                LawPath::Stick => report.stick_solves += 1,
+                LawPath::Newton => report.newton_solves += 1,
+                LawPath::Cone => {}
+            }
+            report.cone_solves += law.cone_solves;
+            report.cone_iterations += law.cone_iterations;
+            report.law_residual = law.residual;
+
+            for k in 0..n {
+                self.free_velocity[k] = self.new_impulse[k] - self.impulse[k];
+            }
+            let response = &self.response_c[..n * n];
+            ContactLaw::apply(response, &self.free_velocity[..n], &mut self.scratch[..n]);
+            report.velocity_change = largest(&self.scratch[..n]);
+            ContactLaw::apply(response, &self.new_impulse[..n], &mut self.scratch[..n]);
+            let scale = largest(&self.scratch[..n]) + self.gravity * self.time_step;
+            let settled = report.velocity_change <= self.options.tolerance * scale;
+            report.converged = settled && law.converged;
+            if settled || report.rounds >= self.options.max_rounds {
+                return Ok(());
+            }
+            self.move_to_new_impulses(tree, pushes)?;
+            rounds_left -= 1;
+            let keep = rounds_left > 0 && report.velocity_change <= LARGE_CHANGE * scale;
+            if !keep {
+                rounds_left = ROUNDS_PER_RESPONSE;
+            }
+            self.newton(tree, report, keep)?;
+        }
+    }
+
+    fn response_is_current(&self) -> bool {
+        let candidates = self.candidates.iter().map(|candidate| candidate.contact);
+        !self.response_of.is_empty() && self.response_of.iter().copied().eq(candidates)
+    }
+
+    /// `W` in the contact frames.
+    fn update_response(&mut self, tree: &KinematicTree) -> Result<(), StepError> {
+        let m = self.candidates.len();
+        let n = 3 * m;
+        let s = self.options.unknown_nodes;
+        self.response_of.clear();
+        self.response.solve(tree, &self.del, &mut self.solver, &self.loads)?;
+        let world = &mut self.response_w[..n * n];
+        self.response.velocity_response_into(tree, &mut self.end, s, &self.loads, world)?;
+        for i in 0..m {
+            let own = &self.results[self.candidates[i].contact].frame;
+            for j in 0..m {
+                let other = &self.results[self.candidates[j].contact].frame;
+                let block = Matrix3::from_fn(|r, c| world[(3 * i + r) * n + 3 * j + c]);
+                let turned = own * block * other.transpose();
+                for r in 0..3 {
+                    for c in 0..3 {
+                        self.response_c[(3 * i + r) * n + 3 * j + c] = turned[(r, c)];
+                    }
+                }
+            }
+        }
+        self.response_of.extend(self.candidates.iter().map(|candidate| candidate.contact));
+        Ok(())
+    }
+
+    fn solve_law(&mut self) -> LawReport {
+        let n = 3 * self.candidates.len();
+        for (i, candidate) in self.candidates.iter().enumerate() {
+            let point = &self.points[candidate.contact];
+            let x = self.end.point_w(point);
+            let frame = &self.results[candidate.contact].frame;
+            let velocity = frame * self.end.velocity_at_w(point.body, &x);
+            self.end_velocity[3 * i..3 * i + 3].copy_from_slice(velocity.as_slice());
+        }
+        let response = &self.response_c[..n * n];
+        ContactLaw::apply(response, &self.impulse[..n], &mut self.scratch[..n]);
+        for k in 0..n {
+            self.free_velocity[k] = self.end_velocity[k] - self.scratch[k];
+        }
+        for (i, candidate) in self.candidates.iter().enumerate() {
+            self.free_velocity[3 * i + 2] -= candidate.target;
+        }
+        let problem = ContactProblem {
+            response,
+            free_velocity: &self.free_velocity[..n],
+            friction: &self.friction[..n / 3],
+            last_impulse: &self.last_impulse[..n],
+        };
+        self.new_impulse[..n].copy_from_slice(&self.impulse[..n]);
+        self.law.solve(&problem, &mut self.new_impulse[..n])
+    }
+
+    /// `λ := λ_new`, and the nodes where the response puts them.
+    fn move_to_new_impulses(&mut self, tree: &KinematicTree, pushes: usize) -> Result<(), StepError> {
+        let m = self.candidates.len();
+        for i in 0..m {
+            let before = self.impulse_w(i);
+            self.impulse[3 * i..3 * i + 3].copy_from_slice(&self.new_impulse[3 * i..3 * i + 3]);
+            let after = self.impulse_w(i);
+            self.scratch[3 * i..3 * i + 3].copy_from_slice((after - before).as_slice());
+            self.del.set_point_force(pushes + i, &(after / self.time_step))?;
+        }
+        let s = self.options.unknown_nodes;
+        if let Some(nodes) = self.response.nodes() {
+            for dof in 0..tree.dof() {
+                for alpha in 1..=s {
+                    let row = dof * s + alpha - 1;
+                    let change: f64 = (0..3 * m).map(|c| nodes.get(row, c) * self.scratch[c]).sum();
+                    self.del.move_node(alpha, dof, change);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// The state and the motion at the end of the step, from the nodes.
+    fn finish_nodes(&mut self, tree: &KinematicTree) -> Result<(), StepError> {
+        self.del.next_state_into(tree, &mut self.next);
+        self.end.update(tree, &self.next)
+    }
+
+    fn first_newton(
+        &mut self,
+        tree: &KinematicTree,
+        state: &State,
+        continues: bool,
+        report: &mut ContactReport,
+    ) -> Result<(), StepError> {
+        if continues {
+            self.guess_by_extrapolation(tree);
+            if self.newton(tree, report, self.factor_age < MAX_FACTOR_AGE).is_ok() {
+                return Ok(());
+            }
+        }
+        self.guess_by_velocity(tree, state);
+        self.newton(tree, report, false)
+    }
+
+    fn guess_by_extrapolation(&mut self, tree: &KinematicTree) {
+        let count = self.options.unknown_nodes + 1;
+        for dof in 0..tree.dof() {
+            let nodes = &self.previous_nodes[dof * count..(dof + 1) * count];
+            for alpha in 1..count {
+                let value = if dof < tree.base_dof() {
+                    // The chart moves with the body: the same rotation and travel once more.
+                    nodes[alpha]
+                } else {
+                    let row = &self.extrapolation[alpha * count..(alpha + 1) * count];
+                    row.iter().zip(nodes).map(|(l, q)| l * q).sum()
+                };
+                self.del.set_node(alpha, dof, value);
+            }
+        }
+    }
+
+    fn guess_by_velocity(&mut self, tree: &KinematicTree, state: &State) {
+        let dt = self.time_step;
+        let rate = self.start.velocity();
+        let mut half = [0.0; 6];
+        if tree.is_floating() {
+            let omega = Vector3::new(rate[0], rate[1], rate[2]);
+            let linear = Vector3::new(rate[3], rate[4], rate[5]);
+            let pose = &state.base_pose;
+            let turn = pose.rotation.tr_mul(&omega) * (0.5 * dt);
+            let center = pose.rotation * exp_rotation(&turn);
+            let travel = center.tr_mul(&(linear + omega.cross(&pose.translation))) * (0.5 * dt);
+            half = [turn.x, turn.y, turn.z, travel.x, travel.y, travel.z];
+        }
+        for alpha in 1..=self.options.unknown_nodes {
+            let c = self.del.rule().nodes()[alpha];
+            for dof in 0..tree.dof() {
+                let value = if dof < tree.base_dof() {
+                    (2.0 * c - 1.0) * half[dof]
+                } else {
+                    state.q[dof - tree.base_dof()] + c * dt * rate[dof]
+                };
+                self.del.set_node(alpha, dof, value);
+            }
+        }
+    }
+
+    /// Newton's method from the nodes in `del`, which it leaves evaluated at the solution.
+    fn newton(
+        &mut self,
+        tree: &KinematicTree,
+        report: &mut ContactReport,
+        keep_factors: bool,
+    ) -> Result<(), StepError> {
+        let s = self.options.unknown_nodes;
+        for (dof, end) in self.guessed_end.iter_mut().enumerate() {
+            *end = self.del.node(s, dof);
+        }
+        let mut renew = !keep_factors;
+        let (mut residual, mut last_change) = (f64::INFINITY, f64::INFINITY);
+        for iteration in 0..MAX_ITERATIONS {
+            self.del.evaluate(tree, &[]);
+            self.del.residual_into(tree, &mut self.direction);
+            residual = largest(&self.direction);
+            if let Some(index) = self.direction.iter().position(|x| !x.is_finite()) {
+                return Err(StepError::NonFinite { quantity: "DEL residual (coordinate * s + node)", index });
+            }
+            if renew {
+                self.response_of.clear();
+                self.factor_age = MAX_FACTOR_AGE;
+                self.solver.factor(tree, &self.del)?;
+                self.factor_age = 0;
+                report.factorizations += 1;
+                self.contraction = 1.0;
+            }
+            self.solver.solve(tree, &mut self.direction);
+            report.iterations += 1;
+            let change = largest(&self.direction);
+            if !change.is_finite() {
+                return Err(StepError::NotConverged { residual, change, iterations: report.iterations });
+            }
+            let size = 1.0 + self.largest_joint_node(tree);
+            if change <= NO_CHANGE * size {
+                return self.accept(tree);
+            }
+            for dof in 0..tree.dof() {
+                for alpha in 1..=s {
+                    self.del.move_node(alpha, dof, -self.direction[dof * s + alpha - 1]);
+                }
+            }
+            let contraction = change / last_change;
+            if iteration > 0 {
+                self.contraction = contraction.max(1e-8);
+            }
+            if change <= SMALL_CHANGE * size
+                || change * self.contraction <= PREDICTED_CHANGE * size
+                || (change <= STAGNATION_CHANGE * size && iteration > 0 && contraction > 0.5)
+            {
+                self.del.evaluate(tree, &[]);
+                return self.accept(tree);
+            }
+            renew = iteration > 0 && contraction > RENEW_CONTRACTION;
+            last_change = change;
+        }
+        Err(StepError::NotConverged { residual, change: last_change, iterations: report.iterations })
+    }
+
+    fn largest_joint_node(&self, tree: &KinematicTree) -> f64 {
+        let s = self.options.unknown_nodes;
+        (tree.base_dof()..tree.dof()).map(|dof| self.del.node(s, dof).abs()).fold(0.0, f64::max)
+    }
+
+    /// Refuses solutions that are not the continuation of the motion.
+    fn accept(&self, tree: &KinematicTree) -> Result<(), StepError> {
+        let s = self.options.unknown_nodes;
+        if tree.is_floating() {
+            let half = (0..3).map(|k| self.del.node(s, k).powi(2)).sum::<f64>().sqrt();
+            let limit = core::f64::consts::FRAC_PI_2;
+            if half > limit {
+                return Err(StepError::SpuriousSolution { dof: 0, change: 2.0 * half, limit: 2.0 * limit });
+            }
+        }
+        for (body, spec) in tree.bodies().iter().enumerate().skip(tree.first_joint_body()) {
+            if spec.joint.kind == JointKind::Revolute {
+                let dof = tree.joint_dof(body);
+                let change = (self.del.node(s, dof) - self.guessed_end[dof]).abs();
+                if change > TURN_LIMIT {
+                    return Err(StepError::SpuriousSolution { dof, change, limit: TURN_LIMIT });
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Stores nodes and impulses for the next step, and what happened at the contacts.
+    fn keep(&mut self, tree: &KinematicTree) {
+        let count = self.options.unknown_nodes + 1;
+        for dof in 0..tree.dof() {
+            for alpha in 0..count {
+                self.previous_nodes[dof * count + alpha] = self.del.node(alpha, dof);
+            }
+        }
+        self.has_previous = true;
+        for (point, result) in self.points.iter().zip(&mut self.results) {
+            result.end_w = self.end.point_w(point);
+            result.velocity_w = self.end.velocity_at_w(point.body, &result.end_w);
+            result.normal_impulse = 0.0;
+            result.touching = false;
+            result.mean_point_w = Vector3::zeros();
+            for alpha in 0..count {
+                let weight = self.del.rule().weights()[alpha];
+                let pose = self.del.body_pose(point.body, alpha);
+                result.mean_point_w += pose.transform_point(&point.point_b) * weight;
+            }
+        }
+        let load_limit = 1e-6 * self.weight * self.time_step;
+        for i in 0..self.candidates.len() {
+            let impulse = self.impulse_w(i);
+            let result = &mut self.results[self.candidates[i].contact];
+            result.impulse_w = impulse;
+            result.normal_impulse = self.impulse[3 * i + 2];
+            result.touching = result.normal_impulse > load_limit;
+        }
+    }
+}
+
+fn check(
+    tree: &KinematicTree,
+    contacts: &[ContactPoint],
+    options: &ContactOptions,
+) -> Result<(), PlantError> {
+    for contact in contacts {
+        if contact.body >= tree.body_count() {
+            let (got, expected) = (contact.body, tree.body_count());
+            return Err(PlantError::Shape { quantity: "body of a contact point", got, expected });
+        }
+        check_friction(contact.friction)?;
+        for value in contact.point.iter() {
+            require(value.is_finite(), "a contact point", *value, "finite")?;
+        }
+    }
+    let Regularisation { strength, forgetting } = options.regularisation;
+    let share = |x: f64| (0.0..=1.0).contains(&x);
+    require(
+        options.correction > 0.0 && share(options.correction),
+        "correction",
+        options.correction,
+        "in (0, 1]",
+    )?;
+    require(share(strength), "regularisation", strength, "in [0, 1]")?;
+    require(share(forgetting), "forgetting", forgetting, "in [0, 1]")?;
+    require(options.tolerance > 0.0 && options.tolerance < 1.0, "tolerance", options.tolerance, "in (0, 1)")?;
+    require(options.max_rounds > 0, "rounds", options.max_rounds as f64, "at least 1")?;
+    require(options.max_candidates <= 64, "candidates", options.max_candidates as f64, "at most 64")
+}
+
+fn check_friction(friction: f64) -> Result<(), PlantError> {
+    require(
+        friction.is_finite() && friction >= 0.0,
+        "friction coefficient",
+        friction,
+        "finite and not negative",
+    )
+}

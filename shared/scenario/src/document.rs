@@ -1,0 +1,313 @@
+//! From text and overrides to a [`Scenario`].
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use toml::de::{DeTable, DeValue};
+use toml::{Spanned, Table, Value};
+
+use crate::range::check;
+use crate::{Place, Scenario, ScenarioError};
+
+/// Larger files are no scenarios.
+const LARGEST_FILE: u64 = 1 << 20;
+
+/// A scenario file, with overrides, and where each key came from.
+#[derive(Debug, Clone)]
+pub struct Document {
+    file: String,
+    table: Table,
+    places: BTreeMap<String, Place>,
+    catalogue: Value,
+}
+
+impl Document {
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// [`ScenarioError::Unreadable`], and those of [`Self::parse`].
+    pub fn read(path: impl AsRef<Path>) -> Result<Self, ScenarioError> {
+        let path = path.as_ref();
+        let file = path.display().to_string();
+        let unreadable = |cause: String| ScenarioError::Unreadable { file: file.clone(), cause };
+        let metadata = std::fs::metadata(path).map_err(|error| unreadable(error.to_string()))?;
+        if !metadata.is_file() {
+            return Err(unreadable("not a regular file".to_owned()));
+        }
+        if metadata.len() > LARGEST_FILE {
+            return Err(unreadable(format!("larger than {LARGEST_FILE} bytes")));
+        }
+        let text = std::fs::read_to_string(path).map_err(|error| unreadable(error.to_string()))?;
+        let mut document = Self::parse(&file, &text)?;
+        if let Some(stem) = path.file_stem().and_then(|stem| stem.to_str()) {
+            let name = Value::String(stem.to_owned());
+            document.table.entry("name").or_insert(name);
+        }
+        Ok(document)
+    }
+
+    /// Takes a text; `file` names it in messages. Checks that it is TOML and that every key is known and of the right type.
+    ///
+    /// # Errors
+    /// [`ScenarioError::Syntax`], [`ScenarioError::UnknownKey`], [`ScenarioError::WrongType`].
+    pub fn parse(file: &str, text: &str) -> Result<Self, ScenarioError> {
+        let syntax = |error: toml::de::Error| ScenarioError::Syntax {
+            file: file.to_owned(),
+            line: line_of(text, error.span().map_or(0, |span| span.start)),
+            what: error.message().to_owned(),
+        };
+        let spanned = DeTable::parse(text).map_err(syntax)?;
+        let catalogue = Value::try_from(Scenario::catalogue()).unwrap_or(Value::Table(Table::new()));
+        let mut document =
+            Self { file: file.to_owned(), table: Table::new(), places: BTreeMap::new(), catalogue };
+        document.note_places("", spanned.get_ref(), text);
+        let table: Table = toml::from_str(text).map_err(syntax)?;
+        document.table =
+            document.typed("", Value::Table(table), &document.catalogue)?.try_into().map_err(syntax)?;
+        Ok(document)
+    }
+
+    /// Overrides a key: `key=value`, with the value as in TOML; strings may go without quotes. `push.…` means the first push.
+    ///
+    /// # Errors
+    /// [`ScenarioError::MalformedOverride`], [`ScenarioError::UnknownKey`], [`ScenarioError::WrongType`].
+    pub fn set(&mut self, text: &str) -> Result<(), ScenarioError> {
+        let malformed = || ScenarioError::MalformedOverride { text: text.to_owned() };
+        let (key, value) = text.split_once('=').ok_or_else(malformed)?;
+        let (key, value) = (key.trim(), value.trim());
+        if key.is_empty() || value.is_empty() {
+            return Err(malformed());
+        }
+        let bare = || Value::String(value.to_owned());
+        let value = toml::from_str::<Table>(&format!("value = {value}"))
+            .ok()
+            .filter(|table| table.len() == 1)
+            .and_then(|mut table| table.remove("value"))
+            .unwrap_or_else(bare);
+        // Checked as if it were alone in a file, then put into ours.
+        let mut wrapped = value;
+        for part in key.rsplit('.') {
+            wrapped = Value::Table(Table::from_iter([(part.to_owned(), wrapped)]));
+        }
+        let place = Place::Override(text.to_owned());
+        if let Some(name) = key.strip_prefix("push.") {
+            self.places.insert(format!("push[0].{name}"), place.clone());
+        }
+        self.places.insert(key.to_owned(), place);
+        let wrapped = self.typed("", wrapped, &self.catalogue)?;
+        if let Value::Table(changes) = wrapped {
+            merge(&mut self.table, changes);
+        }
+        Ok(())
+    }
+
+    /// The scenario, with defaults filled in and all ranges checked.
+    ///
+    /// # Errors
+    /// [`ScenarioError::OutOfRange`]; [`ScenarioError::WrongType`] for a word that is none of the allowed ones.
+    pub fn scenario(&self) -> Result<Scenario, ScenarioError> {
+        let scenario: Scenario = self.table.clone().try_into().map_err(|error: toml::de::Error| {
+            let message = error.message().to_owned();
+            let (file, place) = (self.file.clone(), Place::Absent);
+            ScenarioError::WrongType {
+                file,
+                place,
+                key: "?".to_owned(),
+                found: message,
+                expected: "?".to_owned(),
+            }
+        })?;
+        check(&scenario).map_err(|violation| ScenarioError::OutOfRange {
+            file: self.file.clone(),
+            place: self.place(&violation.key),
+            key: violation.key,
+            value: violation.value,
+            rule: violation.rule,
+            remedy: violation.remedy,
+        })?;
+        Ok(scenario)
+    }
+
+    /// The value brought to the types of the catalogue (whole numbers become floating ones where the key is one).
+    fn typed(&self, key: &str, value: Value, pattern: &Value) -> Result<Value, ScenarioError> {
+        let wrong = |found: &Value, expected: String| {
+            Err(ScenarioError::WrongType {
+                file: self.file.clone(),
+                place: self.place(key),
+                key: key.to_owned(),
+                found: describe(found),
+                expected,
+            })
+        };
+        match (value, pattern) {
+            (Value::Table(table), Value::Table(known)) => {
+                let mut typed = Table::new();
+                for (name, value) in table {
+                    let inner = join(key, &name);
+                    let Some(pattern) = known.get(&name) else {
+                        return Err(self.unknown(key, &inner, &name, known));
+                    };
+                    typed.insert(name, self.typed(&inner, value, pattern)?);
+                }
+                Ok(Value::Table(typed))
+            }
+            (Value::Array(list), Value::Table(_)) if key == "push" => {
+                let each = |(index, value)| self.typed(&format!("{key}[{index}]"), value, pattern);
+                Ok(Value::Array(list.into_iter().enumerate().map(each).collect::<Result<_, _>>()?))
+            }
+            (Value::Array(list), Value::Array(known)) => {
+                let numbers = list.iter().all(|value| matches!(value, Value::Float(_) | Value::Integer(_)));
+                if list.len() != known.len() || !numbers {
+                    return wrong(&Value::Array(list), format!("a list of {} numbers", known.len()));
+                }
+                let each = |(value, pattern)| self.typed(key, value, pattern);
+                Ok(Value::Array(list.into_iter().zip(known).map(each).collect::<Result<_, _>>()?))
+            }
+            (Value::Integer(value), Value::Float(_)) => Ok(Value::Float(value as f64)),
+            (Value::Integer(value), Value::Integer(_)) if value < 0 => {
+                wrong(&Value::Integer(value), "a whole number from 0 on".to_owned())
+            }
+            (Value::String(value), Value::String(_)) => match words(key) {
+                Some(words) if !words.contains(&value.as_str()) => {
+                    let quoted: Vec<String> = words.iter().map(|word| format!("\"{word}\"")).collect();
+                    wrong(&Value::String(value), quoted.join(" or "))
+                }
+                _ => Ok(Value::String(value)),
+            },
+            (value, pattern) if value.same_type(pattern) => Ok(value),
+            (value, pattern) => wrong(&value, expected_type(pattern)),
+        }
+    }
+
+    fn unknown(&self, table: &str, key: &str, name: &str, known: &Table) -> ScenarioError {
+        let nearest = known
+            .keys()
+            .map(|candidate| (edit_distance(name, candidate), candidate))
+            .filter(|(distance, candidate)| {
+                *distance <= 3.min(candidate.len() / 2).max(1) || starts_alike(name, candidate)
+            })
+            .min()
+            .map(|(_, candidate)| join(table, candidate));
+        ScenarioError::UnknownKey {
+            file: self.file.clone(),
+            place: self.place(key),
+            key: key.to_owned(),
+            nearest,
+            known: known.keys().map(|name| join(table, name)).collect(),
+        }
+    }
+
+    /// Where a key was given.
+    fn place(&self, key: &str) -> Place {
+        self.places.get(key).cloned().unwrap_or(Place::Absent)
+    }
+
+    fn note_places(&mut self, table: &str, content: &DeTable<'_>, text: &str) {
+        for (name, value) in content {
+            let key = join(table, name.get_ref());
+            self.places.insert(key.clone(), Place::Line(line_of(text, name.span().start)));
+            self.note_values(&key, value, text);
+        }
+    }
+
+    fn note_values(&mut self, key: &str, value: &Spanned<DeValue<'_>>, text: &str) {
+        match value.get_ref() {
+            DeValue::Table(inner) => self.note_places(key, inner, text),
+            DeValue::Array(list) => {
+                for (index, value) in list.iter().enumerate() {
+                    let key = format!("{key}[{index}]");
+                    self.places.insert(key.clone(), Place::Line(line_of(text, value.span().start)));
+                    self.note_values(&key, value, text);
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+impl Scenario {
+    /// The effective configuration as a scenario file: every key.
+    pub fn to_toml(&self) -> String {
+        let body = toml::to_string(self).unwrap_or_default();
+        format!("# Effective configuration: every key with the value that was used.\n{body}")
+    }
+}
+
+/// Puts `changes` into `table`; where `table` has a list of tables and `changes` one table, into the first of the list.
+fn merge(table: &mut Table, changes: Table) {
+    for (name, change) in changes {
+        match (table.get_mut(&name), change) {
+            (Some(Value::Table(old)), Value::Table(change)) => merge(old, change),
+            (Some(Value::Array(list)), Value::Table(change)) => match list.first_mut() {
+                Some(Value::Table(first)) => merge(first, change),
+                _ => list.push(Value::Table(change)),
+            },
+            (_, change) => {
+                table.insert(name, change);
+            }
+        }
+    }
+}
+
+/// The allowed words of a key that takes one of a few.
+fn words(key: &str) -> Option<&'static [&'static str]> {
+    match key {
+        "clock" => Some(&["realtime", "lockstep"]),
+        "controller.kind" => Some(&["mpc", "static-lqr", "off"]),
+        _ => None,
+    }
+}
+
+fn describe(value: &Value) -> String {
+    match value {
+        Value::String(text) => format!("the text \"{text}\""),
+        Value::Integer(number) => format!("the whole number {number}"),
+        Value::Float(number) => format!("the number {number}"),
+        Value::Boolean(yes) => format!("the truth value {yes}"),
+        Value::Datetime(time) => format!("the time {time}"),
+        Value::Array(list) => format!("a list of {}", list.len()),
+        Value::Table(_) => "a table".to_owned(),
+    }
+}
+
+fn expected_type(pattern: &Value) -> String {
+    match pattern {
+        Value::String(_) => "a text in quotes",
+        Value::Integer(_) => "a whole number",
+        Value::Float(_) => "a number",
+        Value::Boolean(_) => "true or false",
+        Value::Datetime(_) => "a time",
+        Value::Array(list) => return format!("a list of {} numbers", list.len()),
+        Value::Table(_) => "a table of keys",
+    }
+    .to_owned()
+}
+
+fn join(table: &str, name: &str) -> String {
+    if table.is_empty() { name.to_owned() } else { format!("{table}.{name}") }
+}
+
+fn line_of(text: &str, offset: usize) -> usize {
+    1 + text.bytes().take(offset).filter(|byte| *byte == b'\n').count()
+}
+
+/// One is the other with something after it, as `duration` and `duration_s`: a forgotten unit.
+fn starts_alike(a: &str, b: &str) -> bool {
+    a.len() >= 3 && b.starts_with(a) || b.len() >= 3 && a.starts_with(b)
+}
+
+/// Fewest insertions, deletions and replacements from one word to the other.
+fn edit_distance(a: &str, b: &str) -> usize {
+    let b: Vec<char> = b.chars().collect();
+    let mut row: Vec<usize> = (0..=b.len()).collect();
+    for (i, x) in a.chars().enumerate() {
+        let mut diagonal = row[0];
+        row[0] = i + 1;
+        for (j, y) in b.iter().enumerate() {
+            let cost = if x == *y { diagonal } else { 1 + diagonal.min(row[j]).min(row[j + 1]) };
+            diagonal = row[j + 1];
+            row[j + 1] = cost;
+        }
+    }
+    row[b.len()]
+}

@@ -1,0 +1,196 @@
+//! The rules values must keep. Each names the key, the value, the rule and a remedy.
+
+use crate::{ControllerSettings, Scenario};
+
+/// A broken rule.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Violation {
+    pub(crate) key: String,
+    pub(crate) value: String,
+    pub(crate) rule: String,
+    pub(crate) remedy: String,
+}
+
+/// A control cycle may differ from a whole number of plant steps by this part of a step: round-off of the two decimal numbers.
+const WHOLE_STEPS: f64 = 1e-6;
+
+/// Weights beyond this cannot be told from an infinite one in double precision.
+const LARGEST_WEIGHT: f64 = 1e9;
+
+/// All rules, in the order of the keys; the first one broken.
+pub(crate) fn check(scenario: &Scenario) -> Result<(), Violation> {
+    let Scenario { duration_s, robot, plant, sensors, controller, process, success, .. } = scenario;
+    within("seed", scenario.seed as f64, 0.0, i64::MAX as f64)?;
+    positive("duration_s", *duration_s, 3600.0)?;
+    named("robot.urdf", &robot.urdf, "a URDF file, for example configs/robots/atlas.urdf")?;
+
+    within("plant.step_s", plant.step_s, 1e-5, 1e-3)?;
+    within("plant.friction", plant.friction, 0.0, 10.0)?;
+    within("plant.mass_scale", plant.mass_scale, 0.1, 10.0)?;
+    within("plant.inertia_scale", plant.inertia_scale, 0.1, 10.0)?;
+    within("plant.actuator_delay_s", plant.actuator_delay_s, 0.0, 0.1)?;
+    whole("duration_s", *duration_s, "plant.step_s", *duration_s / plant.step_s)?;
+
+    within("sensors.noise_scale", sensors.noise_scale, 0.0, 100.0)?;
+    within("sensors.delay_s", sensors.delay_s, 0.0, 0.1)?;
+    for (key, value) in [
+        ("sensors.position_noise_rad", sensors.position_noise_rad),
+        ("sensors.position_bias_rad", sensors.position_bias_rad),
+        ("sensors.position_resolution_rad", sensors.position_resolution_rad),
+        ("sensors.velocity_noise_rad_s", sensors.velocity_noise_rad_s),
+        ("sensors.velocity_resolution_rad_s", sensors.velocity_resolution_rad_s),
+        ("sensors.base_position_noise_m", sensors.base_position_noise_m),
+        ("sensors.base_orientation_noise_rad", sensors.base_orientation_noise_rad),
+        ("sensors.base_velocity_noise_m_s", sensors.base_velocity_noise_m_s),
+        ("sensors.gyro_noise_rad_s", sensors.gyro_noise_rad_s),
+        ("sensors.gyro_bias_rad_s", sensors.gyro_bias_rad_s),
+    ] {
+        within(key, value, 0.0, 1.0)?;
+    }
+    within("sensors.foot_force_noise_n", sensors.foot_force_noise_n, 0.0, 1e4)?;
+    within("sensors.foot_torque_noise_nm", sensors.foot_torque_noise_nm, 0.0, 1e4)?;
+
+    within("controller.mpc_rate_hz", controller.mpc_rate_hz, 1.0, 1000.0)?;
+    let cycle = 1.0 / (controller.mpc_rate_hz * plant.step_s);
+    whole("controller.mpc_rate_hz", controller.mpc_rate_hz, "plant.step_s", cycle)?;
+    let servo = controller.servo_rate_hz;
+    if !((servo * plant.step_s - 1.0).abs() <= WHOLE_STEPS) {
+        let rule = "the servo acts in every plant step";
+        let remedy = format!("give 1 / `plant.step_s` = {}", 1.0 / plant.step_s);
+        return Err(violation("controller.servo_rate_hz", servo.to_string(), rule, &remedy));
+    }
+    within("controller.horizon_s", controller.horizon_s, 0.02, 5.0)?;
+    within("controller.stages", controller.stages as f64, 2.0, 64.0)?;
+    within("controller.delay_cycles", f64::from(controller.delay_cycles), 0.0, 10.0)?;
+
+    within("controller.max_state_age_s", controller.max_state_age_s, 1e-3, 10.0)?;
+    within("controller.command_life_s", controller.command_life_s, 1e-3, 10.0)?;
+    check_controller(controller)?;
+
+    within("process.priority", f64::from(process.priority), 0.0, 99.0)?;
+    within("process.hang_s", process.hang_s, 0.1, 3600.0)?;
+
+    if let Some(reach) = &scenario.reach {
+        named("reach.hand", &reach.hand, "a frame of the robot, for example l_hand_point")?;
+        each("reach.ball_m", &reach.ball_m, 100.0)?;
+        within("reach.start_s", reach.start_s, 0.0, 3600.0)?;
+        positive("reach.deadline_s", reach.deadline_s, 3600.0)?;
+        within("reach.hold_s", reach.hold_s, 0.0, 3600.0)?;
+        positive("reach.return_s", reach.return_s, 3600.0)?;
+    }
+    for (index, push) in scenario.push.iter().enumerate() {
+        let key = |name: &str| match scenario.push.len() {
+            1 => format!("push.{name}"),
+            _ => format!("push[{index}].{name}"),
+        };
+        named(&key("link"), &push.link, "a link of the robot, for example utorso")?;
+        each(&key("direction"), &push.direction, 1e6)?;
+        if push.direction.iter().all(|x| *x == 0.0) {
+            let value = format!("{:?}", push.direction);
+            return Err(violation(
+                &key("direction"),
+                value,
+                "it has no direction",
+                "take for example [0, 1, 0] for left",
+            ));
+        }
+        within(&key("impulse_ns"), push.impulse_ns, 0.0, 1e4)?;
+        within(&key("start_s"), push.start_s, 0.0, 3600.0)?;
+        within(&key("duration_s"), push.duration_s, plant.step_s, 3600.0)?;
+    }
+
+    for (key, value) in [
+        ("success.hand_error_at_deadline_m", success.hand_error_at_deadline_m),
+        ("success.hand_error_hold_max_m", success.hand_error_hold_max_m),
+        ("success.max_stance_slip_m", success.max_stance_slip_m),
+        ("success.max_stance_tilt_rad", success.max_stance_tilt_rad),
+        ("success.max_torque_ratio", success.max_torque_ratio),
+        ("success.settle_time_s", success.settle_time_s),
+        ("success.min_real_time_factor", success.min_real_time_factor),
+    ] {
+        within(key, value, 0.0, f64::MAX)?;
+    }
+    within("success.min_cop_margin_m", success.min_cop_margin_m, -10.0, 10.0)
+}
+
+fn check_controller(controller: &ControllerSettings) -> Result<(), Violation> {
+    let (weights, limits) = (&controller.weights, &controller.constraints);
+    let [com_x, com_y, com_z] = weights.com_per_m2;
+    let [speed_x, speed_y, speed_z] = weights.com_velocity_s2_per_m2;
+    let [spin_x, spin_y, spin_z] = weights.spin_per_n2m2s2;
+    for (name, value) in [
+        ("posture_per_rad2", weights.posture_per_rad2),
+        ("joint_speed_s2_per_rad2", weights.joint_speed_s2_per_rad2),
+        ("com_per_m2", com_x),
+        ("com_per_m2", com_y),
+        ("com_per_m2", com_z),
+        ("com_velocity_s2_per_m2", speed_x),
+        ("com_velocity_s2_per_m2", speed_y),
+        ("com_velocity_s2_per_m2", speed_z),
+        ("spin_per_n2m2s2", spin_x),
+        ("spin_per_n2m2s2", spin_y),
+        ("spin_per_n2m2s2", spin_z),
+        ("hand_per_m2", weights.hand_per_m2),
+        ("hand_velocity_s2_per_m2", weights.hand_velocity_s2_per_m2),
+        ("swing_foot_per_m2", weights.swing_foot_per_m2),
+        ("swing_foot_rotation_per_rad2", weights.swing_foot_rotation_per_rad2),
+    ] {
+        within(&format!("controller.weights.{name}"), value, 0.0, LARGEST_WEIGHT)?;
+    }
+    within("controller.weights.torque_per_limit2", weights.torque_per_limit2, 1e-6, LARGEST_WEIGHT)?;
+    within("controller.constraints.torque_fraction", limits.torque_fraction, 0.01, 1.0)?;
+    within("controller.constraints.friction", limits.friction, 0.01, 10.0)?;
+    within("controller.constraints.cop_margin_m", limits.cop_margin_m, 0.0, 1.0)?;
+    within("controller.constraints.yaw_arm_m", limits.yaw_arm_m, 1e-4, 10.0)
+}
+
+/// NaN is in no range.
+fn within(key: &str, value: f64, least: f64, most: f64) -> Result<(), Violation> {
+    if (least..=most).contains(&value) {
+        return Ok(());
+    }
+    let rule = match most {
+        f64::MAX => format!("must be a number from {least} on"),
+        _ => format!("must lie in {least} .. {most}"),
+    };
+    let nearest = if value > most { most } else { least };
+    Err(violation(key, value.to_string(), &rule, &format!("the nearest allowed value is {nearest}")))
+}
+
+fn positive(key: &str, value: f64, most: f64) -> Result<(), Violation> {
+    if value > 0.0 && value <= most {
+        return Ok(());
+    }
+    let rule = format!("must be above 0 and at most {most}");
+    Err(violation(key, value.to_string(), &rule, "give a time in that range"))
+}
+
+fn each(key: &str, values: &[f64], largest: f64) -> Result<(), Violation> {
+    if values.iter().all(|value| value.abs() <= largest) {
+        return Ok(());
+    }
+    let rule = format!("every component must be a number of at most {largest}");
+    Err(violation(key, format!("{values:?}"), &rule, "check the sign and the unit"))
+}
+
+/// `steps` plant steps must be a whole number of at least one.
+fn whole(key: &str, value: f64, step_key: &str, steps: f64) -> Result<(), Violation> {
+    let nearest = steps.round().max(1.0);
+    if (steps - nearest).abs() <= WHOLE_STEPS * nearest {
+        return Ok(());
+    }
+    let rule = format!("must be a whole number of steps of `{step_key}`, not {steps}");
+    let remedy = format!("take the value that gives {nearest} steps, or change `{step_key}`");
+    Err(violation(key, value.to_string(), &rule, &remedy))
+}
+
+fn named(key: &str, value: &str, what: &str) -> Result<(), Violation> {
+    if !value.is_empty() {
+        return Ok(());
+    }
+    Err(violation(key, "\"\"".to_owned(), "is missing", &format!("name {what}")))
+}
+
+fn violation(key: &str, value: String, rule: &str, remedy: &str) -> Violation {
+    Violation { key: key.to_owned(), value, rule: rule.to_owned(), remedy: remedy.to_owned() }
+}

@@ -1,0 +1,450 @@
+//! The keys of a scenario. Field names are the key names.
+
+use serde::{Deserialize, Serialize};
+
+/// Everything that decides a run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Scenario {
+    /// Name in figures and folders; the file's name when not given.
+    pub name: String,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Which clock the run follows.
+    pub clock: Clock,
+    /// Length of the run, s.
+    pub duration_s: f64,
+    /// The robot and how it stands.
+    pub robot: RobotSettings,
+    /// The simulation.
+    pub plant: PlantSettings,
+    /// The sensors.
+    pub sensors: SensorSettings,
+    /// The controller.
+    pub controller: ControllerSettings,
+    /// The operating system's part: priority, memory, cores.
+    pub process: ProcessSettings,
+    /// A ball to fetch.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reach: Option<ReachSettings>,
+    /// Pushes: one table `[push]` or a list `[[push]]`.
+    #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
+    pub push: Vec<PushSettings>,
+    /// What counts as success.
+    pub success: SuccessSettings,
+}
+
+/// Which clock a run follows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Clock {
+    /// The wall clock; a late command is a late command.
+    Realtime,
+    /// One state, one command, as fast as it goes; the same seed gives the same bytes.
+    Lockstep,
+}
+
+/// The robot and how it stands at the beginning.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RobotSettings {
+    /// URDF file, relative to the scenario file; its companion table lies beside it.
+    pub urdf: String,
+    /// Sole it stands on, by its name in the companion table.
+    pub stance: String,
+    /// Posture it begins and rests in, by its name in the companion table.
+    pub posture: String,
+}
+
+/// The simulation.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PlantSettings {
+    /// Time step, s.
+    pub step_s: f64,
+    /// Coefficient of friction between robot and ground.
+    pub friction: f64,
+    /// The plant's masses and inertias are those of the model times this.
+    pub mass_scale: f64,
+    /// The inertias about the mass centres are further multiplied by this.
+    pub inertia_scale: f64,
+    /// Time from a torque asked to the torque given, s; rounded to whole steps.
+    pub actuator_delay_s: f64,
+    /// Whether the actuators keep to the torque limits of the URDF.
+    pub torque_limits: bool,
+}
+
+/// The sensors. Their noise is given at `noise_scale = 1`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SensorSettings {
+    /// Multiplies all noise and bias; 0 switches these and the resolutions off.
+    pub noise_scale: f64,
+    /// Age of a measurement when it is sent, s; rounded to whole steps.
+    pub delay_s: f64,
+    /// Noise of joint positions (rad or m). Noise is a standard deviation, new in every step.
+    pub position_noise_rad: f64,
+    /// Bias of joint positions (rad or m). Bias is a standard deviation, drawn once.
+    pub position_bias_rad: f64,
+    /// Smallest step of joint positions (rad or m).
+    pub position_resolution_rad: f64,
+    /// Noise of joint velocities (rad/s or m/s).
+    pub velocity_noise_rad_s: f64,
+    /// Smallest step of joint velocities (rad/s or m/s).
+    pub velocity_resolution_rad_s: f64,
+    /// Noise of the base position (m).
+    pub base_position_noise_m: f64,
+    /// Noise of the base orientation about each axis (rad).
+    pub base_orientation_noise_rad: f64,
+    /// Noise of the base's linear velocity (m/s).
+    pub base_velocity_noise_m_s: f64,
+    /// Noise of the base's angular velocity (rad/s).
+    pub gyro_noise_rad_s: f64,
+    /// Bias of the base's angular velocity (rad/s).
+    pub gyro_bias_rad_s: f64,
+    /// Noise of the foot's force sensor (N).
+    pub foot_force_noise_n: f64,
+    /// Noise of the foot's torque sensor (N m).
+    pub foot_torque_noise_nm: f64,
+}
+
+/// What computes the torques.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ControllerKind {
+    /// Model-predictive control.
+    Mpc,
+    /// One linear-quadratic regulator about the posture, torques clamped.
+    StaticLqr,
+    /// No torque.
+    Off,
+}
+
+/// The controller.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ControllerSettings {
+    /// What computes the torques.
+    pub kind: ControllerKind,
+    /// Control cycles per second.
+    pub mpc_rate_hz: f64,
+    /// How often per second the feedback law of the last command is evaluated.
+    pub servo_rate_hz: f64,
+    /// How far the controller looks ahead, s.
+    pub horizon_s: f64,
+    /// Stages the horizon is cut into.
+    pub stages: usize,
+    /// Control cycles from a state to the first moment its command may act.
+    pub delay_cycles: u32,
+    /// Oldest measurement the controller believes, s.
+    pub max_state_age_s: f64,
+    /// How long a command may be applied, s.
+    pub command_life_s: f64,
+    /// What the controller trades against each other.
+    pub weights: WeightSettings,
+    /// What it must keep to.
+    pub constraints: ConstraintSettings,
+}
+
+/// Weights of the controller's tasks: one over the square of the deviation that counts 1. 0 switches a task off.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct WeightSettings {
+    /// Every joint away from its reference, 1/rad².
+    pub posture_per_rad2: f64,
+    /// Every joint's speed, 1/(rad/s)².
+    pub joint_speed_s2_per_rad2: f64,
+    /// Every joint's torque, per square of its limit.
+    pub torque_per_limit2: f64,
+    /// Mass centre along x, y, z, 1/m².
+    pub com_per_m2: [f64; 3],
+    /// Its velocity, 1/(m/s)².
+    pub com_velocity_s2_per_m2: [f64; 3],
+    /// Angular momentum about it, 1/(N m s)².
+    pub spin_per_n2m2s2: [f64; 3],
+    /// Hand away from its way to the ball, 1/m².
+    pub hand_per_m2: f64,
+    /// Its velocity, 1/(m/s)².
+    pub hand_velocity_s2_per_m2: f64,
+    /// Swing foot away from where it hangs, 1/m².
+    pub swing_foot_per_m2: f64,
+    /// Its rotation, 1/rad².
+    pub swing_foot_rotation_per_rad2: f64,
+}
+
+/// Constraints of the controller. Joint limits come from the robot.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ConstraintSettings {
+    /// Part of the torque limits the plan may use.
+    pub torque_fraction: f64,
+    /// Coefficient of friction the plan counts on.
+    pub friction: f64,
+    /// Distance the plan keeps the pressure point from the edge of the sole, m.
+    pub cop_margin_m: f64,
+    /// Yaw torque the plan counts on, per vertical force, m.
+    pub yaw_arm_m: f64,
+}
+
+/// What is asked of the operating system. What it refuses is a warning, not an error.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ProcessSettings {
+    /// Real-time priority (SCHED_FIFO) of both processes, 1 to 99; 0: ordinary priority.
+    pub priority: u8,
+    /// Whether all memory is kept in RAM.
+    pub lock_memory: bool,
+    /// Core of the plant process; any when not given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub plant_core: Option<usize>,
+    /// Core of the controller process; any when not given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub controller_core: Option<usize>,
+    /// A process without a sign of life for this long has failed, s.
+    pub hang_s: f64,
+}
+
+/// A ball to fetch with a hand.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ReachSettings {
+    /// Frame of the robot that must reach the ball.
+    pub hand: String,
+    /// The ball in the sole frame at the start, m.
+    pub ball_m: [f64; 3],
+    /// When the motion begins, s.
+    pub start_s: f64,
+    /// When the hand must be there, s after `start_s`.
+    pub deadline_s: f64,
+    /// How long it stays there, s.
+    pub hold_s: f64,
+    /// How long the way back takes, s.
+    pub return_s: f64,
+}
+
+/// A push: a constant force on the mass centre of a link.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PushSettings {
+    /// Link that is pushed.
+    pub link: String,
+    /// Direction in the sole frame at the start, of any length: x forward, y left, z up.
+    pub direction: [f64; 3],
+    /// Force times duration, N s.
+    pub impulse_ns: f64,
+    /// When it begins, s.
+    pub start_s: f64,
+    /// How long it lasts, s.
+    pub duration_s: f64,
+}
+
+/// What counts as success. A criterion about something that does not happen in the run is fulfilled.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SuccessSettings {
+    /// The robot must not fall.
+    pub no_fall: bool,
+    /// A foot that is in the air at the start must not touch the ground.
+    pub no_touch_down: bool,
+    /// Largest distance of hand and ball at the deadline, m.
+    pub hand_error_at_deadline_m: f64,
+    /// Largest distance of hand and ball while holding, m.
+    pub hand_error_hold_max_m: f64,
+    /// Farthest the stance foot may slip, m.
+    pub max_stance_slip_m: f64,
+    /// Farthest the stance foot may tilt, rad.
+    pub max_stance_tilt_rad: f64,
+    /// Smallest distance of the pressure point from the edge of the sole, m.
+    pub min_cop_margin_m: f64,
+    /// Largest torque relative to its limit.
+    pub max_torque_ratio: f64,
+    /// Longest time from a push until the robot is at rest again, s.
+    pub settle_time_s: f64,
+    /// Realtime only: smallest speed of the simulation relative to the wall clock.
+    pub min_real_time_factor: f64,
+}
+
+impl Default for Scenario {
+    fn default() -> Self {
+        Self {
+            name: String::new(),
+            seed: 1,
+            clock: Clock::Realtime,
+            duration_s: 10.0,
+            robot: RobotSettings::default(),
+            plant: PlantSettings::default(),
+            sensors: SensorSettings::default(),
+            controller: ControllerSettings::default(),
+            process: ProcessSettings::default(),
+            reach: None,
+            push: Vec::new(),
+            success: SuccessSettings::default(),
+        }
+    }
+}
+
+impl Default for PlantSettings {
+    fn default() -> Self {
+        Self {
+            step_s: 0.001,
+            friction: 0.7,
+            mass_scale: 1.0,
+            inertia_scale: 1.0,
+            actuator_delay_s: 0.0,
+            torque_limits: true,
+        }
+    }
+}
+
+impl Default for SensorSettings {
+    /// Good encoders, a tactical inertial unit with leg odometry, strain gauges under the foot.
+    fn default() -> Self {
+        Self {
+            noise_scale: 1.0,
+            delay_s: 0.0,
+            position_noise_rad: 2e-5,
+            position_bias_rad: 0.0,
+            position_resolution_rad: 1e-5,
+            velocity_noise_rad_s: 2e-3,
+            velocity_resolution_rad_s: 0.0,
+            base_position_noise_m: 1e-4,
+            base_orientation_noise_rad: 1e-4,
+            base_velocity_noise_m_s: 2e-3,
+            gyro_noise_rad_s: 2e-3,
+            gyro_bias_rad_s: 0.0,
+            foot_force_noise_n: 2.0,
+            foot_torque_noise_nm: 0.2,
+        }
+    }
+}
+
+impl Default for ControllerSettings {
+    fn default() -> Self {
+        Self {
+            kind: ControllerKind::Mpc,
+            mpc_rate_hz: 200.0,
+            servo_rate_hz: 1000.0,
+            horizon_s: 0.7,
+            stages: 20,
+            delay_cycles: 1,
+            max_state_age_s: 0.05,
+            command_life_s: 0.1,
+            weights: WeightSettings::default(),
+            constraints: ConstraintSettings::default(),
+        }
+    }
+}
+
+impl Default for WeightSettings {
+    /// Bryson's rule: 0.22 rad of posture, 1.4 rad/s, 2 cm of the mass centre, 7 cm/s, 1 cm of the hand count 1 each.
+    fn default() -> Self {
+        Self {
+            posture_per_rad2: 20.0,
+            joint_speed_s2_per_rad2: 0.5,
+            torque_per_limit2: 500.0,
+            com_per_m2: [2000.0, 2000.0, 0.0],
+            com_velocity_s2_per_m2: [200.0, 200.0, 0.0],
+            spin_per_n2m2s2: [0.0; 3],
+            hand_per_m2: 10_000.0,
+            hand_velocity_s2_per_m2: 10.0,
+            swing_foot_per_m2: 0.0,
+            swing_foot_rotation_per_rad2: 0.0,
+        }
+    }
+}
+
+impl Default for ConstraintSettings {
+    fn default() -> Self {
+        Self { torque_fraction: 0.98, friction: 0.6, cop_margin_m: 0.008, yaw_arm_m: 0.06 }
+    }
+}
+
+impl Default for ProcessSettings {
+    fn default() -> Self {
+        Self { priority: 50, lock_memory: true, plant_core: None, controller_core: None, hang_s: 2.0 }
+    }
+}
+
+impl Default for ReachSettings {
+    fn default() -> Self {
+        Self {
+            hand: String::new(),
+            ball_m: [0.0; 3],
+            start_s: 1.0,
+            deadline_s: 1.3,
+            hold_s: 1.0,
+            return_s: 1.5,
+        }
+    }
+}
+
+impl Default for PushSettings {
+    fn default() -> Self {
+        Self {
+            link: String::new(),
+            direction: [0.0, 1.0, 0.0],
+            impulse_ns: 0.0,
+            start_s: 0.0,
+            duration_s: 0.1,
+        }
+    }
+}
+
+impl Default for SuccessSettings {
+    fn default() -> Self {
+        Self {
+            no_fall: true,
+            no_touch_down: true,
+            hand_error_at_deadline_m: 0.02,
+            hand_error_hold_max_m: 0.03,
+            max_stance_slip_m: 0.005,
+            max_stance_tilt_rad: 1.0_f64.to_radians(),
+            min_cop_margin_m: 0.0,
+            max_torque_ratio: 1.0,
+            settle_time_s: 2.5,
+            min_real_time_factor: 0.9,
+        }
+    }
+}
+
+impl Scenario {
+    /// A scenario in which every key exists, however few a file gives: the catalogue of keys and of their types.
+    pub(crate) fn catalogue() -> Self {
+        Self {
+            process: ProcessSettings {
+                plant_core: Some(0),
+                controller_core: Some(1),
+                ..ProcessSettings::default()
+            },
+            reach: Some(ReachSettings::default()),
+            push: vec![PushSettings::default()],
+            ..Self::default()
+        }
+    }
+
+    /// Plant steps per control cycle. The range checks make it a whole number.
+    pub fn steps_per_cycle(&self) -> u32 {
+        (1.0 / (self.controller.mpc_rate_hz * self.plant.step_s)).round() as u32
+    }
+
+    /// Plant steps of the whole run.
+    pub fn steps(&self) -> u64 {
+        (self.duration_s / self.plant.step_s).round() as u64
+    }
+
+    /// Things that are allowed but probably not meant.
+    pub fn warnings(&self) -> Vec<String> {
+        let end = self.duration_s;
+        let mut warnings = Vec::new();
+        if let Some(reach) = self.reach.as_ref().filter(|reach| reach.start_s + reach.deadline_s > end) {
+            let deadline = reach.start_s + reach.deadline_s;
+            warnings
+                .push(format!("the ball's deadline at {deadline} s is after the end of the run at {end} s"));
+        }
+        for push in self.push.iter().filter(|push| push.impulse_ns > 0.0 && push.start_s >= end) {
+            let start = push.start_s;
+            warnings.push(format!("the push at {start} s is after the end of the run at {end} s"));
+        }
+        warnings
+    }
+}

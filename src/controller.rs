@@ -1,0 +1,78 @@
+//! `delmpc controller`: the controller process.
+
+use delmpc_controller_process::controller_loop::ControllerLoop;
+use delmpc_controller_process::figures::CycleFigures;
+use delmpc_controller_process::membership::Membership;
+use delmpc_messages::{Command, Role, Verdict};
+use delmpc_scenario::{Clock, Scenario};
+use delmpc_transport::Channel;
+
+use crate::cli::PartArguments;
+use crate::part::{ended, leave_part, message_run_id, prepare_machine, run_id, say};
+use crate::robot_controller::RobotController;
+use crate::run_folder::CONTROLLER_PART;
+use crate::setup::Setup;
+use crate::summary::ControllerPart;
+use crate::verdict::{Ended, Failure};
+
+/// Runs the command. `allocations` counts the heap allocations of this process so far.
+///
+/// # Errors
+/// [`Failure::Input`] before anything runs, [`Failure::Fault`] when the run broke off.
+pub fn controller(arguments: &PartArguments, allocations: fn() -> u64) -> Result<Ended, Failure> {
+    let setup = Setup::read(&arguments.scenario, &arguments.set)?;
+    let scenario = &setup.scenario;
+    let run = run_id(arguments, &setup)?;
+    let mut controller = RobotController::new(&setup)?;
+    prepare_machine(Role::Controller, scenario);
+
+    let hash = setup.joint_set_hash();
+    let mut membership =
+        Membership::join(run, hash, Role::Controller, arguments.supervised, scenario.process.hang_s)
+            .map_err(Failure::fault)?;
+    if !arguments.supervised {
+        say(&format!("run {run}: the controller waits for a plant of the same scenario"));
+    }
+    let commands = membership.node().publisher(Channel::Command).map_err(Failure::fault)?;
+    let states = membership.node().subscriber(Channel::State).map_err(Failure::fault)?;
+    let blank = Command::new(message_run_id(run, scenario), hash, setup.robot.joint_names.len() as u32);
+    let mut controller_loop = ControllerLoop::new(scenario, states, commands, &blank);
+    if scenario.clock == Clock::Realtime {
+        controller_loop = controller_loop.counting(allocations);
+    }
+    let (ending, figures) =
+        controller_loop.run(&mut controller, &mut membership).map_err(Failure::fault)?;
+    leave_part(arguments.out.as_deref(), CONTROLLER_PART, &part(scenario, &figures))?;
+    ended(ending, "plant")
+}
+
+/// The controller's part of the summary. Times and allocations are those of the
+/// machine: in lockstep they are left out, so that runs are reproducible.
+pub fn part(scenario: &Scenario, figures: &CycleFigures) -> ControllerPart {
+    let realtime = scenario.clock == Clock::Realtime;
+    let [p50, p99, p999, max] = figures.percentiles_s(|cycle| cycle.total_ns, [0.5, 0.99, 0.999, 1.0]);
+    let [linearize] = figures.percentiles_s(|cycle| cycle.linearize_ns, [0.5]);
+    let [riccati] = figures.percentiles_s(|cycle| cycle.riccati_ns, [0.5]);
+    let [qp] = figures.percentiles_s(|cycle| cycle.qp_ns, [0.5]);
+    let timed = |value: Option<f64>| value.filter(|_| realtime);
+    let verdicts = |verdict: Verdict| figures.verdicts[verdict as usize];
+    ControllerPart {
+        cycles: figures.count(),
+        cycle_time_p50_s: timed(p50),
+        cycle_time_p99_s: timed(p99),
+        cycle_time_p999_s: timed(p999),
+        cycle_time_max_s: timed(max),
+        linearize_p50_s: timed(linearize),
+        riccati_p50_s: timed(riccati),
+        qp_p50_s: timed(qp),
+        qp_solves: figures.qp_solves,
+        qp_iterations_max: figures.qp_iterations_max,
+        deadline_misses: figures.deadline_misses,
+        fallback_level_max: figures.fallback_level_max,
+        allocations_per_cycle_max: realtime.then_some(figures.allocations_max),
+        verdicts_late: verdicts(Verdict::Late),
+        verdicts_infeasible: verdicts(Verdict::Infeasible),
+        verdicts_model_mismatch: verdicts(Verdict::ModelMismatch),
+        verdicts_bad_state: verdicts(Verdict::BadState),
+    }
+}

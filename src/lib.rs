@@ -1,0 +1,42 @@
+//! The command `delmpc`: its parts as a library, so that tests can use them without a terminal.
+//!
+//! One file per subcommand ([`run`], [`plant`], [`controller`], [`model`], [`replay`]); what they share:
+//!
+//! | file | what it does |
+//! |---|---|
+//! | [`cli`] | arguments |
+//! | [`verdict`] | how a command ends: exit status and message |
+//! | [`setup`] | scenario and robot from their files, checked against each other |
+//! | [`simulated_robot`], [`robot_controller`] | plant and controller made from a setup |
+//! | [`run_folder`] | the folder a run leaves behind |
+//! | [`supervisor`] | starts, watches and ends the two processes |
+//! | [`part`] | what the two processes have in common |
+//! | [`plant_process`] | the loop of the plant process |
+//! | [`one_process`] | both loops in one process |
+//! | [`truth`], [`observer`], [`metrics`], [`sole`] | what happened, and the figures made of it |
+//! | [`summary`] | all figures, success, the table a person reads |
+//! | [`log`] | the log of states, commands and truth |
+//! | [`status_line`] | one line about the running run |
+
+pub mod cli;
+pub mod controller;
+pub mod log;
+pub mod metrics;
+pub mod model;
+pub mod observer;
+pub mod one_process;
+pub mod part;
+pub mod plant;
+pub mod plant_process;
+pub mod replay;
+pub mod robot_controller;
+pub mod run;
+pub mod run_folder;
+pub mod setup;
+pub mod simulated_robot;
+pub mod sole;
+pub mod status_line;
+pub mod summary;
+pub mod supervisor;
+pub mod truth;
+pub mod verdict;

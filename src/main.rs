@@ -1,0 +1,31 @@
+//! The command `delmpc`: parse, call, report how it ended.
+
+use std::alloc::System;
+use std::process::ExitCode;
+
+use clap::Parser;
+use delmpc::cli::{Cli, Command, RunArguments};
+use delmpc::verdict::exit_code;
+use stats_alloc::{INSTRUMENTED_SYSTEM, StatsAlloc};
+
+/// Counts allocations: a control cycle should make none of its own.
+#[global_allocator]
+static ALLOCATOR: &StatsAlloc<System> = &INSTRUMENTED_SYSTEM;
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let command = cli.command.unwrap_or(Command::Run(RunArguments { scenario: None, options: cli.options }));
+    exit_code(match command {
+        Command::Run(arguments) => delmpc::run::run(&arguments),
+        Command::Plant(arguments) => delmpc::plant::plant(&arguments),
+        Command::Controller(arguments) => delmpc::controller::controller(&arguments, allocations),
+        Command::Model(arguments) => delmpc::model::model(&arguments),
+        Command::Replay(arguments) => delmpc::replay::replay(&arguments),
+    })
+}
+
+/// Heap allocations of this process so far.
+fn allocations() -> u64 {
+    let stats = ALLOCATOR.stats();
+    (stats.allocations + stats.reallocations) as u64
+}

@@ -1,0 +1,421 @@
+//! `delmpc model`: check a robot model; print its table, or everything computed from it at a given state.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+use delmpc_mechanics::energy::{kinetic_energy, potential_energy};
+use delmpc_mechanics::inverse_dynamics::{InverseDynamicsWorkspace, gravity_force_into};
+use delmpc_mechanics::kinematics::{Configuration, Kinematics, base_link_pose, base_pose_from_link};
+use delmpc_mechanics::mass_matrix::{MassMatrixWorkspace, mass_matrix_into};
+use delmpc_mechanics::prelude::{
+    InputHold, Integrator, JointKind, KinematicTree, Linearizer, LobattoRule, RigidTransform, State, StateCoordinates,
+    StepForces, StepOptions, Twist,
+};
+use delmpc_mechanics::velocity::VelocityWorkspace;
+use delmpc_robots::{BaseChoice, LoadOptions, RobotModel, load_with};
+use nalgebra::{DMatrix, DVector, Quaternion, UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
+
+use crate::verdict::{Ended, Failure};
+
+/// Arguments of `delmpc model`.
+#[derive(Debug, clap::Args)]
+pub struct ModelArguments {
+    /// Robot description; the companion table `ROBOT.toml` beside it is read too
+    pub urdf: PathBuf,
+    /// `floating`, or `fixed:NAME` with a link or a frame of the companion table
+    #[arg(long, value_name = "BASE")]
+    pub base: Option<String>,
+    /// State and step as JSON; the answer is one JSON object
+    #[arg(long, value_name = "FILE.json")]
+    pub at: Option<PathBuf>,
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// A model or a state file that cannot be used.
+pub fn model(arguments: &ModelArguments) -> Result<Ended, Failure> {
+    match &arguments.at {
+        Some(file) => {
+            let question = read_question(file)?;
+            let base = arguments.base.clone().or_else(|| question.base.clone());
+            let robot = load_robot(&arguments.urdf, base.as_deref(), question.gravity)?;
+            let answer = answer(&robot, &question).map_err(|error| Failure::Input(format!("{}: {error}", file.display())))?;
+            println!("{}", serde_json::to_string(&answer).map_err(Failure::fault)?);
+        }
+        None => print!("{}", table(&load_robot(&arguments.urdf, arguments.base.as_deref(), None)?)),
+    }
+    Ok(Ended::Well)
+}
+
+/// A state and a step: the file given to `--at`.
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct Question {
+    q: BTreeMap<String, f64>,
+    qdot: BTreeMap<String, f64>,
+    u: Option<BTreeMap<String, f64>>,
+    u_nodes: Option<Vec<BTreeMap<String, f64>>>,
+    dt: Option<f64>,
+    order: Order,
+    gravity: Option<[f64; 3]>,
+    base: Option<String>,
+    base_pose: BasePose,
+    base_twist: BaseTwist,
+}
+
+/// Nodes of the integrator.
+#[derive(Debug, Clone, Copy, Default, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum Order {
+    Trapezoidal,
+    #[default]
+    Simpson,
+    Lobatto3,
+    Lobatto4,
+}
+
+/// Pose of the base link frame in the world.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct BasePose {
+    xyz: [f64; 3],
+    quaternion_xyzw: [f64; 4],
+}
+
+impl Default for BasePose {
+    fn default() -> Self {
+        Self { xyz: [0.0; 3], quaternion_xyzw: [0.0, 0.0, 0.0, 1.0] }
+    }
+}
+
+/// Velocity of the base link and of its origin, in the axes of the base link.
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct BaseTwist {
+    angular: [f64; 3],
+    linear: [f64; 3],
+}
+
+/// Everything computed. Vectors and matrices are over the joints; those of a floating base begin with six coordinates of the base link:
+/// angular, then linear, in its own axes at its origin.
+#[derive(Debug, Default, Serialize)]
+struct Answer {
+    joints: Vec<String>,
+    floating: bool,
+    total_mass: f64,
+    com: [f64; 3],
+    mass_matrix: Vec<Vec<f64>>,
+    gravity_torque: Vec<f64>,
+    kinetic_energy: f64,
+    potential_energy: f64,
+    p: Vec<f64>,
+    #[serde(flatten)]
+    step: Option<StepAnswer>,
+}
+
+/// What one step gives.
+#[derive(Debug, Serialize)]
+struct StepAnswer {
+    q_next: Vec<f64>,
+    p_next: Vec<f64>,
+    qdot_next: Vec<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    base_pose_next: Option<BasePoseAnswer>,
+    newton_iterations: usize,
+    #[serde(rename = "A")]
+    a: Vec<Vec<f64>>,
+    #[serde(rename = "B")]
+    b: Vec<Vec<f64>>,
+}
+
+#[derive(Debug, Serialize)]
+struct BasePoseAnswer {
+    xyz: [f64; 3],
+    quaternion_xyzw: [f64; 4],
+}
+
+fn read_question(file: &Path) -> Result<Question, Failure> {
+    let name = file.display();
+    let text = std::fs::read_to_string(file)
+        .map_err(|error| Failure::Input(format!("{name}: cannot be read ({error}): give a JSON file")))?;
+    serde_json::from_str(&text).map_err(|error| Failure::Input(format!("{name}: {error}")))
+}
+
+/// Loads a robot with the base of the command line.
+fn load_robot(urdf: &Path, base: Option<&str>, gravity: Option<[f64; 3]>) -> Result<RobotModel, Failure> {
+    let mut options = LoadOptions::default();
+    if let Some(gravity) = gravity {
+        options.gravity_w = Vector3::from(gravity);
+    }
+    let fixed_at = match base {
+        None => None,
+        Some("floating") => {
+            options.base = BaseChoice::Floating;
+            None
+        }
+        Some(other) => match other.strip_prefix("fixed:").filter(|name| !name.is_empty()) {
+            Some(name) => Some(name),
+            None => {
+                return Err(Failure::Input(format!(
+                    "base `{other}`: write `floating` or `fixed:NAME` with the name of a link"
+                )));
+            }
+        },
+    };
+    let Some(name) = fixed_at else {
+        return load_with(urdf, &options).map_err(Failure::input);
+    };
+    options.base = BaseChoice::Fixed(name.to_owned());
+    let as_link = load_with(urdf, &options);
+    // A frame of the companion table, such as a sole.
+    options.base = BaseChoice::Auto;
+    match as_link {
+        Ok(robot) => Ok(robot),
+        Err(error) => {
+            let floating = load_with(urdf, &options).map_err(|_| Failure::input(&error))?;
+            Ok(floating.rooted_at(name).map_err(|_| Failure::input(&error))?.model)
+        }
+    }
+}
+
+fn answer(robot: &RobotModel, question: &Question) -> Result<Answer, String> {
+    let tree = &robot.tree;
+    let base = BaseFrame::new(tree, &question.base_pose)?;
+    let mut state = State::zeros(tree);
+    state.base_pose = base.pose_w;
+    state.q = by_joint(robot, &question.q, "q")?;
+    let joint_rates = by_joint(robot, &question.qdot, "qdot")?;
+    let twist_b = Twist::new(question.base_twist.angular.into(), question.base_twist.linear.into());
+    let twist_w = base.link_pose_w.transform_twist(&twist_b);
+
+    let mut velocity = Vec::new();
+    if tree.is_floating() {
+        velocity.extend(twist_w.to_vector().iter());
+    }
+    velocity.extend(&joint_rates);
+    let mut velocities = VelocityWorkspace::new(tree);
+    velocities.set_velocity(tree, &mut state, &velocity).map_err(|error| error.to_string())?;
+
+    let kinematics = velocities.kinematics();
+    let dof = tree.dof();
+    let mut mass_matrix = vec![0.0; dof * dof];
+    mass_matrix_into(tree, kinematics, &mut MassMatrixWorkspace::new(tree), &mut mass_matrix)
+        .map_err(|error| error.to_string())?;
+    let mut gravity = vec![0.0; dof];
+    gravity_force_into(tree, kinematics, &mut InverseDynamicsWorkspace::new(tree), &mut gravity)
+        .map_err(|error| error.to_string())?;
+    let mass_matrix = DMatrix::from_row_slice(dof, dof, &mass_matrix);
+    let map = base.velocity_map(tree);
+    let mut answer = Answer {
+        joints: robot.joint_names.clone(),
+        floating: tree.is_floating(),
+        total_mass: tree.total_mass(),
+        com: kinematics.mass_centre_of_tree_w(tree).into(),
+        mass_matrix: rows(&(map.transpose() * mass_matrix * &map)),
+        gravity_torque: (map.transpose() * DVector::from_vec(gravity)).as_slice().to_vec(),
+        kinetic_energy: kinetic_energy(tree, kinematics),
+        potential_energy: potential_energy(tree, kinematics, &state.q).map_err(|error| error.to_string())?,
+        p: (map.transpose() * DVector::from_column_slice(&state.p)).as_slice().to_vec(),
+        step: None,
+    };
+    if let Some(dt) = question.dt {
+        answer.step = Some(step(robot, question, dt, &state, &base)?);
+    }
+    Ok(answer)
+}
+
+fn step(
+    robot: &RobotModel,
+    question: &Question,
+    dt: f64,
+    state: &State,
+    base: &BaseFrame,
+) -> Result<StepAnswer, String> {
+    let tree = &robot.tree;
+    let nodes = match question.order {
+        Order::Trapezoidal => 1,
+        Order::Simpson => 2,
+        Order::Lobatto3 => 3,
+        Order::Lobatto4 => 4,
+    };
+    let rule = LobattoRule::new(nodes).map_err(|error| error.to_string())?;
+    let mut integrator =
+        Integrator::new(tree, &rule, dt, StepOptions::default()).map_err(|error| error.to_string())?;
+    let inputs: Vec<f64>;
+    let forces = match (&question.u, &question.u_nodes) {
+        (Some(_), Some(_)) => return Err("both `u` and `u_nodes`: give one".to_owned()),
+        (_, Some(per_node)) if per_node.len() != nodes + 1 => {
+            return Err(format!("`u_nodes` has {} entries: this order has {} nodes", per_node.len(), nodes + 1));
+        }
+        (_, Some(per_node)) => {
+            let each = per_node.iter().map(|u| by_joint(robot, u, "u_nodes"));
+            inputs = each.collect::<Result<Vec<_>, _>>()?.concat();
+            StepForces::per_node(&inputs)
+        }
+        (u, None) => {
+            inputs = by_joint(robot, u.as_ref().unwrap_or(&BTreeMap::new()), "u")?;
+            StepForces::held(&inputs)
+        }
+    };
+    let report = integrator.solve(tree, state, &forces).map_err(|error| error.to_string())?;
+    let next = integrator.next_state().clone();
+    let mut velocity = vec![0.0; tree.dof()];
+    integrator.velocities().velocity_into(tree, &next, &mut velocity).map_err(|error| error.to_string())?;
+    let mut linearizer = Linearizer::new(tree, &integrator, StateCoordinates::Momentum, InputHold::Held)
+        .map_err(|error| error.to_string())?;
+    let linear = linearizer.linearize(tree, &mut integrator).map_err(|error| error.to_string())?;
+
+    let dof = tree.dof();
+    let a = DMatrix::from_fn(2 * dof, 2 * dof, |row, column| linear.a(row, column));
+    let b = DMatrix::from_fn(2 * dof, linear.inputs(), |row, column| linear.b(row, column));
+    let (to_link, from_link) = base.error_map(tree);
+    let after = BaseFrame::at(tree, next.base_pose);
+    let map = after.velocity_map(tree);
+    let joint_rates = DVector::from_vec(velocity);
+    let qdot_next = map.clone().lu().solve(&joint_rates).ok_or("the base pose is not a rigid motion")?;
+    Ok(StepAnswer {
+        q_next: next.q.clone(),
+        p_next: (map.transpose() * DVector::from_column_slice(&next.p)).as_slice().to_vec(),
+        qdot_next: qdot_next.as_slice().to_vec(),
+        base_pose_next: tree.is_floating().then(|| after.answer()),
+        newton_iterations: report.iterations,
+        a: rows(&(&to_link * a * from_link)),
+        b: rows(&(to_link * b)),
+    })
+}
+
+/// The base link frame, and the changes of coordinates from what the mechanics uses to it.
+struct BaseFrame {
+    /// What the mechanics takes: origin at the mass centre.
+    pose_w: RigidTransform,
+    link_pose_w: RigidTransform,
+}
+
+impl BaseFrame {
+    fn new(tree: &KinematicTree, pose: &BasePose) -> Result<Self, String> {
+        let [x, y, z, w] = pose.quaternion_xyzw;
+        let quaternion = Quaternion::new(w, x, y, z);
+        let norm = quaternion.norm();
+        if !tree.is_floating() {
+            let identity = RigidTransform::identity();
+            return Ok(Self { pose_w: identity, link_pose_w: identity });
+        }
+        if !(norm > 0.5 && norm < 2.0) {
+            return Err(format!("`base_pose.quaternion_xyzw` has the length {norm}, must be 1"));
+        }
+        let rotation = UnitQuaternion::from_quaternion(quaternion).to_rotation_matrix().into_inner();
+        let link_pose_w = RigidTransform { rotation, translation: pose.xyz.into() };
+        Ok(Self { pose_w: base_pose_from_link(tree, &link_pose_w), link_pose_w })
+    }
+
+    fn at(tree: &KinematicTree, pose_w: RigidTransform) -> Self {
+        let link_pose_w = if tree.is_floating() { base_link_pose(tree, &pose_w) } else { pose_w };
+        Self { pose_w, link_pose_w }
+    }
+
+    fn answer(&self) -> BasePoseAnswer {
+        let quaternion = UnitQuaternion::from_matrix(&self.link_pose_w.rotation);
+        BasePoseAnswer {
+            xyz: self.link_pose_w.translation.into(),
+            quaternion_xyzw: quaternion.coords.into(),
+        }
+    }
+
+    /// From velocities in our coordinates to those of the mechanics: the twist of the link to the spatial one.
+    fn velocity_map(&self, tree: &KinematicTree) -> DMatrix<f64> {
+        let mut map = DMatrix::identity(tree.dof(), tree.dof());
+        if tree.is_floating() {
+            map.view_mut((0, 0), (6, 6)).copy_from(&self.link_pose_w.adjoint());
+        }
+        map
+    }
+
+    /// From state errors `(ε, δq, δπ, δp)` at the mass centre of the base to those at the link's origin, and back.
+    fn error_map(&self, tree: &KinematicTree) -> (DMatrix<f64>, DMatrix<f64>) {
+        let dof = tree.dof();
+        let mut to_link = DMatrix::identity(2 * dof, 2 * dof);
+        let mut from_link = to_link.clone();
+        if tree.is_floating() {
+            let link_in_body = delmpc_mechanics::spatial::RigidTransform {
+                rotation: self.pose_w.rotation.tr_mul(&self.link_pose_w.rotation),
+                translation: self.pose_w.rotation.tr_mul(&(self.link_pose_w.translation - self.pose_w.translation)),
+            };
+            let (forward, backward) = (link_in_body.inverse().adjoint(), link_in_body.adjoint());
+            to_link.view_mut((0, 0), (6, 6)).copy_from(&forward);
+            from_link.view_mut((0, 0), (6, 6)).copy_from(&backward);
+            to_link.view_mut((dof, dof), (6, 6)).copy_from(&backward.transpose());
+            from_link.view_mut((dof, dof), (6, 6)).copy_from(&forward.transpose());
+        }
+        (to_link, from_link)
+    }
+}
+
+/// Values by joint name as a vector in joint order; missing joints are 0.
+fn by_joint(robot: &RobotModel, values: &BTreeMap<String, f64>, what: &str) -> Result<Vec<f64>, String> {
+    let mut vector = vec![0.0; robot.joint_names.len()];
+    for (name, value) in values {
+        let joint = robot.joint(name).ok_or_else(|| {
+            format!("`{what}.{name}`: the robot has no such joint; its joints are {}", robot.joint_names.join(", "))
+        })?;
+        vector[joint] = *value;
+    }
+    Ok(vector)
+}
+
+fn rows(matrix: &DMatrix<f64>) -> Vec<Vec<f64>> {
+    matrix.row_iter().map(|row| row.iter().copied().collect()).collect()
+}
+
+/// A model as a person reads it.
+fn table(robot: &RobotModel) -> String {
+    let tree = &robot.tree;
+    let mut text = String::new();
+    let base = if tree.is_floating() { "floating base" } else { "fixed base" };
+    let (joints, bodies, mass) = (tree.joint_count(), tree.body_count(), tree.total_mass());
+    let _ = writeln!(text, "{}: {base}, {joints} joints, {bodies} bodies, {mass:.4} kg", robot.name);
+    let mut kinematics = Kinematics::new(tree);
+    let zeros = vec![0.0; joints];
+    if kinematics.update_positions(tree, &Configuration::floating(RigidTransform::identity(), &zeros)).is_ok() {
+        let com = kinematics.mass_centre_of_tree_w(tree);
+        let _ = writeln!(text, "mass centre at zero, base body at the origin: {:.4} {:.4} {:.4} m", com.x, com.y, com.z);
+    }
+    let widest = robot.body_names.iter().chain(&robot.joint_names).map(String::len).max().unwrap_or(0).max(6);
+    let _ = writeln!(
+        text,
+        "\n{:widest$}  {:widest$}  {:9}  {:>9}  {:>9}  {:>9}  {:>9}  {:>9}",
+        "joint", "body", "kind", "mass kg", "lower", "upper", "effort", "speed"
+    );
+    for (index, body) in tree.bodies().iter().enumerate() {
+        let first = tree.first_joint_body();
+        let mass = body.inertia.mass;
+        let name = &robot.body_names[index];
+        if index < first {
+            let _ = writeln!(text, "{:widest$}  {name:widest$}  {:9}  {mass:9.4}", "-", "base");
+            continue;
+        }
+        let joint = index - first;
+        let limit = &robot.limits[joint];
+        let kind = match body.joint.kind {
+            JointKind::Revolute => "revolute",
+            JointKind::Prismatic => "prismatic",
+        };
+        let _ = writeln!(
+            text,
+            "{:widest$}  {name:widest$}  {kind:9}  {mass:9.4}  {:9.4}  {:9.4}  {:9.2}  {:9.2}",
+            robot.joint_names[joint], limit.lower, limit.upper, limit.effort, limit.velocity
+        );
+    }
+    let names = |list: Vec<&str>| if list.is_empty() { "none".to_owned() } else { list.join(", ") };
+    let soles: Vec<&str> = robot.soles.iter().map(|sole| sole.name.as_str()).collect();
+    let postures: Vec<&str> = robot.postures.iter().map(|posture| posture.name.as_str()).collect();
+    let frames: Vec<&str> = robot.frames.iter().map(|frame| frame.name.as_str()).collect();
+    let _ = writeln!(text, "\nsoles: {}\nframes: {}\npostures: {}", names(soles), names(frames), names(postures));
+    let _ = writeln!(text, "contact points: {}", robot.contacts.len());
+    for warning in &robot.warnings {
+        let _ = writeln!(text, "warning: {warning}");
+    }
+    text
+}

@@ -1,0 +1,90 @@
+//! What `delmpc plant` and `delmpc controller` have in common.
+
+use std::io::Write;
+use std::path::Path;
+
+use delmpc_controller_process::controller_loop::Ending;
+use delmpc_controller_process::machine::prepare;
+use delmpc_controller_process::membership::Order;
+use delmpc_messages::{JointSetHasher, Role};
+use delmpc_scenario::{Clock, Scenario};
+use delmpc_transport::RunId;
+use serde::Serialize;
+
+use crate::cli::PartArguments;
+use crate::setup::Setup;
+use crate::verdict::{Ended, Failure};
+
+/// The run a process belongs to: the named one, or one made from the scenario, so that two processes of the same scenario meet.
+///
+/// # Errors
+/// When the name is none of a run.
+pub fn run_id(arguments: &PartArguments, setup: &Setup) -> Result<RunId, Failure> {
+    match &arguments.run_id {
+        Some(text) => text.parse().map_err(|error| Failure::Input(format!("--run-id: {error}"))),
+        None => {
+            let scenario = setup.scenario.to_toml();
+            Ok(RunId(JointSetHasher::new().joint(&scenario).finish()))
+        }
+    }
+}
+
+/// The number of the run in every message: that of the run, or in lockstep the seed, so that runs are reproducible.
+pub fn message_run_id(run: RunId, scenario: &Scenario) -> u64 {
+    match scenario.clock {
+        Clock::Realtime => run.0,
+        Clock::Lockstep => scenario.seed,
+    }
+}
+
+/// Asks the operating system for what the scenario wants, and says what it refused. Lockstep asks for nothing.
+pub fn prepare_machine(role: Role, scenario: &Scenario) {
+    if scenario.clock == Clock::Realtime {
+        let core = match role {
+            Role::Plant => scenario.process.plant_core,
+            _ => scenario.process.controller_core,
+        };
+        for warning in prepare(&scenario.process, core) {
+            say(&format!("warning: {warning}"));
+        }
+    }
+}
+
+/// A line on standard error; that nobody listens is no reason to stop.
+pub fn say(text: &str) {
+    let _ = writeln!(std::io::stderr(), "{text}");
+}
+
+/// Leaves a part of the results in the run's folder, or prints it when there is none.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn leave_part(folder: Option<&Path>, name: &str, part: &impl Serialize) -> Result<(), Failure> {
+    let text = serde_json::to_string_pretty(part).map_err(Failure::fault)?;
+    match folder {
+        None => {
+            println!("{text}");
+            Ok(())
+        }
+        Some(folder) => {
+            let file = folder.join(name);
+            // Whole or not at all: the supervisor may look at any time.
+            let aside = folder.join(format!(".{name}"));
+            let moved = std::fs::write(&aside, text).and_then(|()| std::fs::rename(&aside, &file));
+            moved.map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))
+        }
+    }
+}
+
+/// What the ending of a loop means for the process.
+///
+/// # Errors
+/// When somebody was lost.
+pub fn ended(ending: Ending, other: &str) -> Result<Ended, Failure> {
+    match ending {
+        Ending::Finished => Ok(Ended::Well),
+        Ending::Ordered(Order::SupervisorLost) => Err(Failure::Fault("the supervisor is gone".to_owned())),
+        Ending::Ordered(Order::PeerLost) => Err(Failure::Fault(format!("the {other} process is gone"))),
+        Ending::Ordered(_) => Ok(Ended::Interrupted),
+    }
+}

@@ -1,0 +1,67 @@
+//! `delmpc plant`: the plant process.
+
+use std::collections::BTreeMap;
+
+use delmpc_controller_process::membership::Membership;
+use delmpc_messages::{PlantState, Role};
+use delmpc_scenario::Clock;
+use delmpc_transport::{Channel, RunId};
+
+use crate::cli::PartArguments;
+use crate::log::Log;
+use crate::part::{ended, leave_part, message_run_id, prepare_machine, run_id, say};
+use crate::plant_process::PlantLoop;
+use crate::run_folder::PLANT_PART;
+use crate::setup::Setup;
+use crate::simulated_robot::SimulatedRobot;
+use crate::verdict::{Ended, Failure};
+
+/// Runs the command.
+///
+/// # Errors
+/// [`Failure::Input`] before anything runs, [`Failure::Fault`] when the run broke off.
+pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
+    let setup = Setup::read(&arguments.scenario, &arguments.set)?;
+    let scenario = &setup.scenario;
+    let run = run_id(arguments, &setup)?;
+    let mut robot = SimulatedRobot::new(&setup)?;
+    let log = match &arguments.out {
+        Some(folder) => Log::create(&folder.join("log.mcap"), about(&setup, run), scenario.clock == Clock::Lockstep)?,
+        None => Log::none(),
+    };
+    prepare_machine(Role::Plant, scenario);
+
+    let hash = setup.joint_set_hash();
+    let mut membership = Membership::join(run, hash, Role::Plant, arguments.supervised, scenario.process.hang_s)
+        .map_err(Failure::fault)?;
+    if !arguments.supervised {
+        say(&format!("run {run}: the plant waits for a controller of the same scenario"));
+    }
+    // First the ear, then the mouth: the answer to the first state must not be missed.
+    let commands = membership.node().subscriber(Channel::Command).map_err(Failure::fault)?;
+    let states = membership.node().publisher(Channel::State).map_err(Failure::fault)?;
+    let blank = PlantState::new(message_run_id(run, scenario), hash, setup.robot.joint_names.len() as u32);
+    let plant_loop = PlantLoop::new(scenario, states, commands, &blank, log);
+    let (ending, mut part, log) = plant_loop.run(&mut robot, &mut membership).map_err(Failure::fault)?;
+    part.log_records_dropped = log.finish()?;
+    leave_part(arguments.out.as_deref(), PLANT_PART, &part)?;
+    ended(ending, "controller")
+}
+
+/// What the log says about its run. In lockstep only what is the same in every run of the seed.
+pub fn about(setup: &Setup, run: RunId) -> BTreeMap<String, String> {
+    let scenario = &setup.scenario;
+    let mut about = BTreeMap::from([
+        ("program".to_owned(), concat!("delmpc ", env!("CARGO_PKG_VERSION")).to_owned()),
+        ("scenario".to_owned(), scenario.name.clone()),
+        ("seed".to_owned(), scenario.seed.to_string()),
+        ("configuration".to_owned(), scenario.to_toml()),
+        ("joints".to_owned(), setup.robot.joint_names.join(" ")),
+        ("joint_set_hash".to_owned(), format!("{:016x}", setup.joint_set_hash())),
+    ]);
+    if scenario.clock == Clock::Realtime {
+        about.insert("run".to_owned(), run.to_string());
+        about.insert("plant_pid".to_owned(), std::process::id().to_string());
+    }
+    about
+}

@@ -1,0 +1,358 @@
+//! The loop of the plant process.
+//!
+//! | clock | one turn |
+//! |---|---|
+//! | realtime | wait for the step's time, take the latest command, step, send the state |
+//! | lockstep | send the state, wait for its command, take the steps of one cycle |
+//!
+//! Before either begins, the plant sends its initial state (sequence 1) and waits for the answer: then a controller is there, it has the
+//! same joints, and it is warm.
+//!
+//! In real time the plant follows the wall clock; commands that come late are late. When the plant process itself was held up, by up to
+//! [`MOST_CATCH_UP_NS`], it catches up; when longer, the simulated world has paused: a robot does not run away from its controller because
+//! its simulation was stopped. Pauses are counted, and show in the real-time factor.
+
+use std::collections::VecDeque;
+use std::thread::sleep;
+use std::time::Duration;
+
+use delmpc_controller_process::clock::{monotonic_ns, sleep_until};
+use delmpc_controller_process::controller_loop::Ending;
+use delmpc_controller_process::figures::percentile;
+use delmpc_controller_process::membership::{Attendance, Order};
+use delmpc_messages::{Command, PlantState, ProcessState, status};
+use delmpc_scenario::{Clock, Scenario};
+use delmpc_transport::{LinkError, Publisher, Subscriber};
+
+use crate::log::Log;
+use crate::metrics::Metrics;
+use crate::summary::PlantPart;
+use crate::truth::Truth;
+
+/// Longest hold-up after which the plant catches up with the wall clock.
+pub const MOST_CATCH_UP_NS: u64 = 20_000_000;
+/// Simulated time after a fall (s): enough to see it.
+const AFTER_FALL_S: f64 = 1.0;
+/// Sleep while there is nothing to do.
+const PAUSE: Duration = Duration::from_micros(50);
+/// How long a finished plant waits for the controller to notice (ns).
+const FAREWELL_NS: u64 = 1_000_000_000;
+
+/// What is simulated.
+pub trait Plant {
+    /// A command has come and may act from now on. `false`: it was refused.
+    fn accept(&mut self, command: &Command) -> bool;
+    /// One step.
+    ///
+    /// # Errors
+    /// When the step could not be computed, in words.
+    fn step(&mut self) -> Result<(), String>;
+    /// Fills in what the sensors say now; the loop fills in the header.
+    fn measure(&mut self, state: &mut PlantState);
+    /// Fills in everything that is true now.
+    fn truth(&mut self, truth: &mut Truth);
+}
+
+/// Commands whose time has not come.
+#[derive(Debug)]
+pub struct CommandQueue {
+    waiting: VecDeque<Command>,
+}
+
+impl CommandQueue {
+    /// For a scenario.
+    pub fn new(scenario: &Scenario) -> Self {
+        Self { waiting: VecDeque::with_capacity(scenario.controller.delay_cycles as usize + 4) }
+    }
+
+    /// Takes a command in; a full queue gives up its oldest one.
+    pub fn push(&mut self, command: &Command) {
+        if self.waiting.len() == self.waiting.capacity() {
+            self.waiting.pop_front();
+        }
+        self.waiting.push_back(*command);
+    }
+
+    /// Gives the plant the commands whose time has come; says how many it refused.
+    pub fn hand_over(&mut self, plant: &mut impl Plant, time_ns: u64) -> u64 {
+        let mut refused = 0;
+        while let Some(command) = self.waiting.pop_front_if(|command| command.valid_from_ns <= time_ns) {
+            refused += u64::from(!plant.accept(&command));
+        }
+        refused
+    }
+}
+
+/// Why a run broke off.
+#[derive(Debug, thiserror::Error)]
+pub enum PlantFault {
+    /// A link broke.
+    #[error(transparent)]
+    Link(#[from] LinkError),
+    /// A step could not be computed.
+    #[error("the simulation broke down at {time_s:.4} s: {what}")]
+    Simulation {
+        /// When.
+        time_s: f64,
+        /// What happened.
+        what: String,
+    },
+}
+
+/// The loop, its ends of the links, and what it collects.
+pub struct PlantLoop<'a, P, S> {
+    scenario: &'a Scenario,
+    states: P,
+    commands: S,
+    log: Log,
+    metrics: Metrics,
+    state: Box<PlantState>,
+    truth: Box<Truth>,
+    queue: CommandQueue,
+    step_ns: u64,
+    time_ns: u64,
+    /// When the plant's clock began, by the monotonic clock.
+    start_ns: u64,
+    timing: Timing,
+    commands_refused: u64,
+    watchdog_level_max: u32,
+}
+
+/// What the wall clock said.
+#[derive(Debug, Default)]
+struct Timing {
+    steps_ns: Vec<u64>,
+    ages_ns: Vec<u64>,
+    pauses: u64,
+    begin_ns: u64,
+    end_ns: u64,
+}
+
+impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
+    /// A loop for a scenario. `blank` is a state with run, joint set and joint count filled in.
+    pub fn new(scenario: &'a Scenario, states: P, commands: S, blank: &PlantState, log: Log) -> Self {
+        let realtime = scenario.clock == Clock::Realtime;
+        let room = if realtime { scenario.steps() as usize + 1 } else { 0 };
+        let step_ns = (scenario.plant.step_s * 1e9).round() as u64;
+        Self {
+            scenario,
+            states,
+            commands,
+            log,
+            metrics: Metrics::new(scenario),
+            state: Box::new(*blank),
+            truth: Box::new(Truth::new(blank.n_joints)),
+            queue: CommandQueue::new(scenario),
+            step_ns,
+            time_ns: 0,
+            start_ns: 0,
+            timing: Timing {
+                steps_ns: Vec::with_capacity(room),
+                ages_ns: Vec::with_capacity(room),
+                ..Timing::default()
+            },
+            commands_refused: 0,
+            watchdog_level_max: 0,
+        }
+    }
+
+    /// Runs to the end.
+    ///
+    /// # Errors
+    /// When a link breaks, or a step cannot be computed while the robot stands.
+    pub fn run(
+        mut self,
+        plant: &mut impl Plant,
+        membership: &mut impl Attendance,
+    ) -> Result<(Ending, PlantPart, Log), PlantFault> {
+        plant.truth(&mut self.truth);
+        self.metrics.observe(&self.truth);
+        self.log.truth(&self.truth);
+        let mut ending = self.wait_for_the_first_answer(plant, membership)?;
+        if ending == Ending::Finished {
+            ending = match self.scenario.clock {
+                Clock::Realtime => self.run_by_the_clock(plant, membership)?,
+                Clock::Lockstep => self.run_cycle_by_cycle(plant, membership)?,
+            };
+        }
+        self.say_farewell(plant, membership)?;
+        let part = self.part();
+        Ok((ending, part, self.log))
+    }
+
+    /// Sends the initial state until it is answered, and then until the run may begin.
+    fn wait_for_the_first_answer(
+        &mut self,
+        plant: &mut impl Plant,
+        membership: &mut impl Attendance,
+    ) -> Result<Ending, PlantFault> {
+        self.send_state(plant, 0)?;
+        let mut answered = false;
+        loop {
+            let order = membership.attend()?;
+            if order.ends() {
+                return Ok(Ending::Ordered(order));
+            }
+            answered |= self.receive()? == Some(1);
+            if answered {
+                membership.announce(ProcessState::Ready)?;
+                if order == Order::Run {
+                    break;
+                }
+            }
+            self.states.serve_newcomers()?;
+            sleep(PAUSE);
+        }
+        membership.announce(ProcessState::Running)?;
+        Ok(Ending::Finished)
+    }
+
+    fn run_by_the_clock(
+        &mut self,
+        plant: &mut impl Plant,
+        membership: &mut impl Attendance,
+    ) -> Result<Ending, PlantFault> {
+        self.start_ns = monotonic_ns();
+        self.timing.begin_ns = self.start_ns;
+        for _ in 0..self.scenario.steps() {
+            let due_ns = self.start_ns + self.time_ns + self.step_ns;
+            sleep_until(due_ns);
+            let late_ns = monotonic_ns().saturating_sub(due_ns);
+            if late_ns > MOST_CATCH_UP_NS {
+                self.start_ns += late_ns;
+                self.timing.pauses += 1;
+            }
+            let order = membership.attend()?;
+            if order.ends() {
+                return Ok(Ending::Ordered(order));
+            }
+            self.receive()?;
+            let begin_ns = monotonic_ns();
+            let goes_on = self.step(plant)?;
+            self.timing.steps_ns.push(monotonic_ns() - begin_ns);
+            self.timing.end_ns = monotonic_ns();
+            if !goes_on {
+                break;
+            }
+            self.send_state(plant, 0)?;
+        }
+        Ok(Ending::Finished)
+    }
+
+    fn run_cycle_by_cycle(
+        &mut self,
+        plant: &mut impl Plant,
+        membership: &mut impl Attendance,
+    ) -> Result<Ending, PlantFault> {
+        let steps_per_cycle = u64::from(self.scenario.steps_per_cycle());
+        for index in 0..self.scenario.steps() {
+            if index > 0 && index % steps_per_cycle == 0 {
+                self.send_state(plant, 0)?;
+                if let Some(order) = self.wait_for_the_answer(membership)? {
+                    return Ok(Ending::Ordered(order));
+                }
+            }
+            if !self.step(plant)? {
+                break;
+            }
+        }
+        Ok(Ending::Finished)
+    }
+
+    fn wait_for_the_answer(&mut self, membership: &mut impl Attendance) -> Result<Option<Order>, PlantFault> {
+        let sequence = self.state.header.sequence;
+        loop {
+            if self.receive()? == Some(sequence) {
+                return Ok(None);
+            }
+            let order = membership.attend()?;
+            if order.ends() {
+                return Ok(Some(order));
+            }
+            self.states.serve_newcomers()?;
+            sleep(PAUSE);
+        }
+    }
+
+    /// Takes the latest command into the queue; says which state it answers.
+    fn receive(&mut self) -> Result<Option<u64>, PlantFault> {
+        let Some(command) = self.commands.receive_latest()? else {
+            return Ok(None);
+        };
+        self.queue.push(command);
+        let realtime = self.scenario.clock == Clock::Realtime;
+        if realtime && self.timing.ages_ns.len() < self.timing.ages_ns.capacity() && command.state_sequence > 1 {
+            let measured_ns = self.start_ns + command.state_time_ns;
+            self.timing.ages_ns.push(monotonic_ns().saturating_sub(measured_ns));
+        }
+        self.log.command(self.time_ns, command);
+        Ok(Some(command.state_sequence))
+    }
+
+    /// Gives the plant the commands whose time has come, steps, and looks. `false`: the run is over.
+    fn step(&mut self, plant: &mut impl Plant) -> Result<bool, PlantFault> {
+        self.commands_refused += self.queue.hand_over(plant, self.time_ns);
+        let stepped = plant.step();
+        if let Err(what) = stepped {
+            // A robot that lies on the ground in a way nobody computes has fallen all the same.
+            let fallen = self.truth.status_flags & status::FELL != 0;
+            let time_s = self.time_ns as f64 * 1e-9;
+            return if fallen { Ok(false) } else { Err(PlantFault::Simulation { time_s, what }) };
+        }
+        self.time_ns += self.step_ns;
+        plant.truth(&mut self.truth);
+        self.metrics.observe(&self.truth);
+        self.log.truth(&self.truth);
+        self.watchdog_level_max = self.watchdog_level_max.max(self.truth.watchdog_level);
+        let fell_s = self.metrics.fall_time_s();
+        Ok(fell_s.is_none_or(|fell_s| self.truth.time_s() < fell_s + AFTER_FALL_S))
+    }
+
+    fn send_state(&mut self, plant: &mut impl Plant, extra_flags: u32) -> Result<(), PlantFault> {
+        plant.measure(&mut self.state);
+        self.state.status_flags |= extra_flags;
+        self.state.header.sequence += 1;
+        if self.scenario.clock == Clock::Realtime {
+            self.state.header.sent_at_ns = monotonic_ns();
+        }
+        self.states.send(&self.state)?;
+        self.log.state(self.time_ns, &self.state);
+        Ok(())
+    }
+
+    /// Says that no further state will come, and waits a little for the controller to hear it.
+    fn say_farewell(&mut self, plant: &mut impl Plant, membership: &mut impl Attendance) -> Result<(), PlantFault> {
+        self.send_state(plant, status::FINISHED)?;
+        let begin_ns = monotonic_ns();
+        while !membership.peer_is_done() && monotonic_ns() < begin_ns + FAREWELL_NS {
+            if membership.attend()?.ends() {
+                break;
+            }
+            self.states.serve_newcomers()?;
+            sleep(PAUSE);
+        }
+        membership.announce(ProcessState::Finished)?;
+        Ok(())
+    }
+
+    fn part(&mut self) -> PlantPart {
+        let timing = &mut self.timing;
+        timing.steps_ns.sort_unstable();
+        timing.ages_ns.sort_unstable();
+        let at = |sorted: &[u64], part| percentile(sorted, part).map(|ns| ns as f64 * 1e-9);
+        let realtime = self.scenario.clock == Clock::Realtime;
+        let wall_s = timing.end_ns.saturating_sub(timing.begin_ns) as f64 * 1e-9;
+        let simulated_s = self.time_ns as f64 * 1e-9;
+        PlantPart {
+            robot: self.metrics.figures(),
+            state_to_command_age_p50_s: at(&timing.ages_ns, 0.5),
+            state_to_command_age_p999_s: at(&timing.ages_ns, 0.999),
+            plant_step_p50_s: at(&timing.steps_ns, 0.5),
+            plant_real_time_factor: (wall_s > 0.0).then(|| simulated_s / wall_s),
+            plant_pauses: realtime.then_some(timing.pauses),
+            log_records_dropped: 0,
+            commands_refused: self.commands_refused,
+            watchdog_level_max: self.watchdog_level_max,
+        }
+    }
+}

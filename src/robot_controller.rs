@@ -1,0 +1,138 @@
+//! The controller of a scenario.
+
+use delmpc_controller_core::config::{ConstraintConfig, ControllerConfig};
+use delmpc_controller_core::cycle::Clock as CycleClock;
+use delmpc_controller_core::prelude as core;
+use delmpc_controller_core::prelude::{BodyPoint, ControllerModel, JointLimits, Reach, StanceObservation, TaskWeights};
+use delmpc_controller_process::clock::monotonic_ns;
+use delmpc_controller_process::controller_loop::Controller;
+use delmpc_messages::{Command, PlantState};
+use delmpc_robots::RobotModel;
+use delmpc_scenario::{Clock, ControllerKind, Scenario};
+
+use crate::setup::Setup;
+use crate::verdict::Failure;
+
+/// The cycle, and what times its steps.
+#[derive(Debug)]
+pub struct RobotController {
+    controller: core::Controller,
+    realtime: bool,
+}
+
+/// The machine's clock, for figures of time.
+struct WallClock;
+
+impl CycleClock for WallClock {
+    fn now_ns(&self) -> u64 {
+        monotonic_ns()
+    }
+}
+
+impl RobotController {
+    /// For a scenario.
+    ///
+    /// # Errors
+    /// [`Failure::Input`] when the robot cannot be controlled like that.
+    pub fn new(setup: &Setup) -> Result<Self, Failure> {
+        let refused = |error: &dyn std::fmt::Display| Failure::Input(format!("{}: {error}", setup.scenario.name));
+        let model = model(setup).map_err(|error| refused(&error))?;
+        let mut controller =
+            core::Controller::new(model, config(&setup.scenario)).map_err(|error| refused(&error))?;
+        controller.set_origin_ns(0);
+        Ok(Self { controller, realtime: setup.scenario.clock == Clock::Realtime })
+    }
+}
+
+impl Controller for RobotController {
+    fn cycle(&mut self, state: &PlantState, now_ns: u64, command: &mut Command) {
+        let clock: &dyn CycleClock = if self.realtime { &WallClock } else { &core::StoppedClock };
+        let (header, publish_ns) = (command.header, command.report.publish_ns);
+        *command = *self.controller.cycle(state, now_ns, clock);
+        command.header = header;
+        command.report.publish_ns = publish_ns;
+    }
+}
+
+/// The robot fixed at its stance sole.
+fn model(setup: &Setup) -> Result<ControllerModel, String> {
+    let (robot, scenario) = (&setup.robot, &setup.scenario);
+    let rooted = robot.rooted_at(setup.stance_frame()).map_err(|error| error.to_string())?;
+    let standing = &rooted.model;
+    let posture = standing.posture(&scenario.robot.posture).ok_or("the posture is missing")?;
+    let sole = standing.sole(&scenario.robot.stance).ok_or("the sole is missing")?;
+    let other = standing.soles.iter().find(|sole| sole.name != scenario.robot.stance);
+    Ok(ControllerModel {
+        tree: standing.tree.clone(),
+        message_joint: ControllerModel::message_joints(&rooted.rerooted),
+        joint_set_hash: setup.joint_set_hash(),
+        limits: standing
+            .limits
+            .iter()
+            .map(|limit| JointLimits {
+                lower: limit.lower,
+                upper: limit.upper,
+                effort: limit.effort,
+                velocity: limit.velocity,
+            })
+            .collect(),
+        sole: sole.polygon.iter().map(|corner| (*corner).into()).collect(),
+        hand: scenario.reach.as_ref().and_then(|reach| point(standing, &reach.hand)),
+        swing_foot: other.and_then(|sole| point(standing, &sole.frame)),
+        posture: posture.q.clone(),
+        stance: Some(StanceObservation { floating: robot.tree.clone(), rerooted: rooted.rerooted }),
+    })
+}
+
+/// A frame's origin as a point of its body; `None` when it is fixed to the ground.
+fn point(robot: &RobotModel, frame: &str) -> Option<BodyPoint> {
+    let frame = robot.frame(frame)?;
+    Some(BodyPoint { body: frame.body?, position: frame.pose.translation })
+}
+
+fn config(scenario: &Scenario) -> ControllerConfig {
+    let settings = &scenario.controller;
+    let period_s = 1.0 / settings.mpc_rate_hz;
+    let (weights, limits) = (&settings.weights, &settings.constraints);
+    let delays_s = scenario.sensors.delay_s + scenario.plant.actuator_delay_s;
+    ControllerConfig {
+        kind: match settings.kind {
+            ControllerKind::Mpc => core::ControllerKind::Mpc,
+            ControllerKind::StaticLqr => core::ControllerKind::StaticLqr,
+            ControllerKind::Off => core::ControllerKind::Off,
+        },
+        period_s,
+        delay_s: f64::from(settings.delay_cycles) * period_s + delays_s,
+        stages: ControllerConfig::stages_for(settings.horizon_s, settings.stages),
+        weights: TaskWeights {
+            posture: weights.posture_per_rad2,
+            joint_speed: weights.joint_speed_s2_per_rad2,
+            torque: weights.torque_per_limit2,
+            com: weights.com_per_m2,
+            com_velocity: weights.com_velocity_s2_per_m2,
+            spin: weights.spin_per_n2m2s2,
+            hand: weights.hand_per_m2,
+            hand_velocity: weights.hand_velocity_s2_per_m2,
+            swing_foot: weights.swing_foot_per_m2,
+            swing_foot_rotation: weights.swing_foot_rotation_per_rad2,
+        },
+        constraints: ConstraintConfig {
+            torque_fraction: limits.torque_fraction,
+            friction: limits.friction,
+            cop_margin_m: limits.cop_margin_m,
+            yaw_arm_m: limits.yaw_arm_m,
+            ..ConstraintConfig::default()
+        },
+        reach: scenario.reach.as_ref().map(|reach| Reach {
+            ball_m: reach.ball_m,
+            start_s: reach.start_s,
+            deadline_s: reach.deadline_s,
+            hold_s: reach.hold_s,
+            return_s: reach.return_s,
+        }),
+        max_state_age_s: settings.max_state_age_s,
+        command_life_s: settings.command_life_s,
+        budget_s: period_s,
+        ..ControllerConfig::default()
+    }
+}

@@ -1,0 +1,133 @@
+//! `delmpc run`: a scenario from beginning to end.
+
+use std::io::{IsTerminal, Write};
+use std::path::Path;
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use delmpc_controller_process::stop::StopFlag;
+use delmpc_scenario::Clock;
+use delmpc_transport::{RunId, remove_dead_runs};
+use serde::de::DeserializeOwned;
+
+use crate::cli::RunArguments;
+use crate::one_process::run_in_one_process;
+use crate::run_folder::{CONTROLLER_PART, PLANT_PART, RunFolder};
+use crate::setup::{Setup, scenario_file};
+use crate::status_line::StatusLine;
+use crate::summary::{Summary, table};
+use crate::supervisor::{Course, Supervision};
+use crate::verdict::{Ended, Failure};
+
+/// Runs the command.
+///
+/// # Errors
+/// [`Failure::Input`] before anything runs, [`Failure::Fault`] when the run broke off.
+pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
+    let options = &arguments.options;
+    let file = scenario_file(arguments.scenario.as_deref())?;
+    let setup = Setup::read(&file, &options.set)?;
+    let scenario = &setup.scenario;
+    if options.one_process && scenario.clock != Clock::Lockstep {
+        return Err(Failure::Input("--one-process needs the lockstep clock: add --set clock=lockstep".to_owned()));
+    }
+    let talkative = !options.quiet && !options.json;
+    if !options.quiet {
+        for warning in scenario.warnings() {
+            eprintln!("warning: {warning}");
+        }
+    }
+    let folder = RunFolder::create(options.out.as_deref(), &scenario.name)?;
+    folder.write_inputs(&setup)?;
+    let stop = StopFlag::on_signals().map_err(Failure::fault)?;
+
+    let course = if options.one_process {
+        run_in_one_process(&setup, &folder, &stop)?
+    } else {
+        run_in_two_processes(&setup, &folder, &stop, talkative)?
+    };
+    let (mut plant, mut controller) = (None, None);
+    let mut fault = match course {
+        Course::Finished => None,
+        Course::Interrupted => Some("interrupted".to_owned()),
+        Course::Fault(ref why) => Some(why.clone()),
+    };
+    match (take_part(&folder.file(PLANT_PART)), take_part(&folder.file(CONTROLLER_PART))) {
+        (Ok(plant_part), Ok(controller_part)) => (plant, controller) = (plant_part, controller_part),
+        (Err(error), _) | (_, Err(error)) => fault = fault.or(Some(error)),
+    }
+    if plant.is_none() || controller.is_none() {
+        fault = fault.or(Some("a process left no figures".to_owned()));
+    }
+    let broke_off = fault.is_some();
+    let summary = Summary::new(scenario, plant, controller, fault);
+    let written = summary.write(&folder.file("summary.json"));
+    written.map_err(|error| Failure::Fault(format!("summary.json: {error}")))?;
+
+    if options.json {
+        println!("{}", summary.to_json());
+    } else if talkative {
+        print!("{}", table(&summary, scenario));
+        println!("{}", folder.path().display());
+    }
+    match (course, summary.failure) {
+        (Course::Interrupted, _) => Ok(Ended::Interrupted),
+        (_, Some(failure)) if broke_off => Err(Failure::Fault(failure)),
+        (_, Some(failure)) => {
+            if options.quiet && !options.json {
+                eprintln!("{failure}");
+            }
+            Ok(Ended::CriterionMissed)
+        }
+        (_, None) => Ok(Ended::Well),
+    }
+}
+
+fn run_in_two_processes(
+    setup: &Setup,
+    folder: &RunFolder,
+    stop: &StopFlag,
+    talkative: bool,
+) -> Result<Course, Failure> {
+    remove_dead_runs();
+    let time_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as u64);
+    let run = RunId::from_seeds(time_ns, std::process::id());
+    let scenario = folder.file("scenario.toml");
+    let supervision = Supervision {
+        run,
+        program: std::env::current_exe().map_err(Failure::fault)?,
+        arguments: vec![text(&scenario)?, "--out".to_owned(), text(folder.path())?],
+        messages: folder.file("messages.txt"),
+        show_messages: talkative,
+        hang_s: setup.scenario.process.hang_s,
+    };
+    let show = talkative && std::io::stderr().is_terminal();
+    let mut line = show.then(|| StatusLine::new(setup, run));
+    let course = supervision.supervise(stop, |_| {
+        if let Some(text) = line.as_mut().and_then(StatusLine::next) {
+            let _ = write!(std::io::stderr(), "\r\x1b[K{text}");
+        }
+    });
+    if show {
+        let _ = write!(std::io::stderr(), "\r\x1b[K");
+    }
+    course
+}
+
+/// Reads a process's part of the results and removes the file; `None` when the process left none.
+fn take_part<T: DeserializeOwned>(file: &Path) -> Result<Option<T>, String> {
+    let wrong = |error: &dyn std::fmt::Display| format!("{}: {error}", file.display());
+    match std::fs::read_to_string(file) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(wrong(&error)),
+        Ok(text) => {
+            let part = serde_json::from_str(&text).map_err(|error| wrong(&error))?;
+            std::fs::remove_file(file).map_err(|error| wrong(&error))?;
+            Ok(Some(part))
+        }
+    }
+}
+
+fn text(path: &Path) -> Result<String, Failure> {
+    let text = path.to_str().map(str::to_owned);
+    text.ok_or_else(|| Failure::Input(format!("{}: the path is not UTF-8", path.display())))
+}

@@ -1,0 +1,259 @@
+//! The plant of a scenario: the robot with its feet, actuators, sensors and disturbances, standing in its posture.
+
+use delmpc_mechanics::inverse_dynamics::{InverseDynamicsWorkspace, gravity_force_into};
+use delmpc_mechanics::kinematics::{Configuration, Kinematics};
+use delmpc_mechanics::mass_matrix::{MassMatrixWorkspace, mass_matrix_into};
+use delmpc_mechanics::prelude::State;
+use delmpc_messages::{ClockKind, Command, PlantState};
+use delmpc_plant::prelude as simulation;
+use delmpc_plant::prelude::{
+    ActuatorConfig, ActuatorLimits, ContactPoint, Foot, ModelErrors, MonitorConfig, PlantConfig, PlantModel, SensorConfig,
+    WatchdogConfig,
+};
+use delmpc_robots::RobotModel;
+use delmpc_scenario::{Clock, PushSettings, SensorSettings};
+use nalgebra::Vector3;
+
+use crate::observer::{Motion, Observer};
+use crate::plant_process::Plant;
+use crate::setup::Setup;
+use crate::truth::Truth;
+use crate::verdict::Failure;
+
+/// Stiffness and damping with which the watchdog holds a posture: every joint as an oscillator of this frequency (rad/s) ...
+const WATCHDOG_FREQUENCY: f64 = 12.0;
+/// ... and this damping ratio, carrying the inertia it has in the posture.
+const WATCHDOG_DAMPING_RATIO: f64 = 0.7;
+
+/// The simulation, and what it takes to tell the truth about it.
+#[derive(Debug)]
+pub struct SimulatedRobot {
+    plant: simulation::Plant,
+    observer: Observer,
+    pushes: Vec<simulation::Push>,
+    clock: ClockKind,
+}
+
+impl SimulatedRobot {
+    /// For a scenario, at rest in its posture.
+    ///
+    /// # Errors
+    /// [`Failure::Input`] when the robot cannot be simulated like that.
+    pub fn new(setup: &Setup) -> Result<Self, Failure> {
+        let (robot, scenario) = (&setup.robot, &setup.scenario);
+        let refused = |error: &dyn std::fmt::Display| Failure::Input(format!("{}: {error}", scenario.name));
+        let posture = robot.posture(&scenario.robot.posture);
+        let standing = posture.and_then(|posture| Some((posture, robot.base_pose_w(posture)?)));
+        let (posture, base_pose) = standing.ok_or_else(|| {
+            refused(&format!("`robot.posture`: the posture {} has no base pose", scenario.robot.posture))
+        })?;
+        let mut state = State::zeros(&robot.tree);
+        state.base_pose = base_pose;
+        state.q.copy_from_slice(&posture.q);
+
+        let holding = Holding::new(setup).map_err(|error| refused(&error))?;
+        let model = model(setup)?;
+        let config = config(setup, &holding)?;
+        let mut plant = simulation::Plant::new(&model, &config, &state).map_err(|error| refused(&error))?;
+        plant.preset_torque(&holding.torque).map_err(|error| refused(&error))?;
+        let clock = match scenario.clock {
+            Clock::Realtime => ClockKind::Monotonic,
+            Clock::Lockstep => ClockKind::Simulated,
+        };
+        Ok(Self { plant, observer: Observer::new(setup)?, pushes: config.pushes, clock })
+    }
+}
+
+impl Plant for SimulatedRobot {
+    fn accept(&mut self, command: &Command) -> bool {
+        self.plant.accept(command).is_ok()
+    }
+
+    fn step(&mut self) -> Result<(), String> {
+        self.plant.step().map(|_| ()).map_err(|error| error.to_string())
+    }
+
+    fn measure(&mut self, state: &mut PlantState) {
+        self.plant.fill_state(state);
+        state.clock = self.clock as u32;
+    }
+
+    fn truth(&mut self, truth: &mut Truth) {
+        let readings = self.plant.truth();
+        let motion = Motion {
+            base_link_pose_w: &readings.base_pose_w,
+            base_twist_b: &readings.base_twist_b,
+            position: &readings.position,
+            velocity: &readings.velocity,
+            torque: &readings.applied_torque,
+        };
+        self.observer.observe(&motion, truth);
+
+        let mut message = PlantState::new(0, 0, 0);
+        self.plant.fill_state(&mut message);
+        truth.time_ns = self.plant.time_ns();
+        truth.status_flags = message.status_flags;
+        truth.watchdog_level = message.watchdog_level;
+        truth.contact_flags = self.plant.monitor().contact_flags();
+        let monitor = self.plant.monitor();
+        if let Some(foot) = monitor.reports().get(monitor.stance_foot()) {
+            truth.stance_torque_b = foot.wrench.torque.into();
+            truth.stance_force_b = foot.wrench.force.into();
+            truth.stance_slip_m = foot.slip;
+            truth.sole_tilt_rad = foot.tilt;
+            truth.cop_margin_m = foot.pressure_margin.unwrap_or(f64::NAN);
+            truth.friction_use = foot.pressure_margin.map_or(f64::NAN, |_| foot.friction_use);
+        }
+        let totals = monitor.totals();
+        // Relative to the energy moved; the first joule counts as a joule.
+        truth.energy_balance_error = totals.energy_balance_error().abs() / totals.energy_moved.max(1.0);
+        truth.push_force_w = self.push_force_w(truth.time_ns).into();
+    }
+}
+
+impl SimulatedRobot {
+    /// Force of all pushes in the step that ended at `time_ns`.
+    fn push_force_w(&self, time_ns: u64) -> Vector3<f64> {
+        let step_s = self.plant.contact().time_step();
+        let begin_s = time_ns as f64 * 1e-9 - step_s;
+        self.pushes.iter().map(|push| push.force_over(begin_s, step_s)).sum()
+    }
+}
+
+/// What it takes to hold the posture, per joint of the floating robot: for a robot that stands still on its stance sole.
+struct Holding {
+    torque: Vec<f64>,
+    stiffness: Vec<f64>,
+    damping: Vec<f64>,
+}
+
+impl Holding {
+    fn new(setup: &Setup) -> Result<Self, String> {
+        let robot = &setup.robot;
+        let rooted = robot.rooted_at(setup.stance_frame()).map_err(|error| error.to_string())?;
+        let tree = &rooted.model.tree;
+        let posture = rooted.model.posture(&setup.scenario.robot.posture).ok_or("no posture")?;
+        let mut kinematics = Kinematics::new(tree);
+        let joints = tree.joint_count();
+        let (mut gravity, mut mass_matrix) = (vec![0.0; joints], vec![0.0; joints * joints]);
+        kinematics
+            .update_positions(tree, &Configuration::fixed(&posture.q))
+            .and_then(|()| {
+                gravity_force_into(tree, &kinematics, &mut InverseDynamicsWorkspace::new(tree), &mut gravity)
+            })
+            .and_then(|()| {
+                mass_matrix_into(tree, &kinematics, &mut MassMatrixWorkspace::new(tree), &mut mass_matrix)
+            })
+            .map_err(|error| error.to_string())?;
+        let inertia: Vec<f64> = (0..joints).map(|joint| mass_matrix[joint * joints + joint]).collect();
+        let floating = |rooted_values: &[f64]| {
+            let mut values = vec![0.0; joints];
+            rooted.rerooted.joints_to_floating(rooted_values, &mut values).map_err(|error| error.to_string())?;
+            Ok::<_, String>(values)
+        };
+        let (frequency, ratio) = (WATCHDOG_FREQUENCY, WATCHDOG_DAMPING_RATIO);
+        Ok(Self {
+            torque: floating(&gravity)?,
+            stiffness: floating(&inertia)?.iter().map(|inertia| inertia * frequency * frequency).collect(),
+            damping: floating(&inertia)?.iter().map(|inertia| 2.0 * ratio * inertia * frequency).collect(),
+        })
+    }
+}
+
+fn model(setup: &Setup) -> Result<PlantModel, Failure> {
+    let (robot, scenario) = (&setup.robot, &setup.scenario);
+    let contacts = robot.contacts.iter().map(|contact| {
+        let body = contact.body.ok_or_else(|| on_no_body(&contact.name))?;
+        // A small sphere touches flat ground below its centre.
+        let point = contact.position - contact.radius * Vector3::z();
+        Ok(ContactPoint { body, point, friction: scenario.plant.friction })
+    });
+    let feet = robot.soles.iter().map(|sole| {
+        let frame = robot.frame(&sole.frame).ok_or_else(|| on_no_body(&sole.frame))?;
+        Ok(Foot {
+            body: frame.body.ok_or_else(|| on_no_body(&sole.frame))?,
+            sole: frame.pose,
+            contacts: sole.contacts.clone(),
+            polygon: sole.polygon.iter().map(|corner| (*corner).into()).collect(),
+        })
+    });
+    Ok(PlantModel {
+        tree: robot.tree.clone(),
+        contacts: contacts.collect::<Result<_, Failure>>()?,
+        feet: feet.collect::<Result<_, Failure>>()?,
+        joint_set_hash: setup.joint_set_hash(),
+    })
+}
+
+fn config(setup: &Setup, holding: &Holding) -> Result<PlantConfig, Failure> {
+    let Setup { robot, scenario, .. } = setup;
+    let plant = &scenario.plant;
+    let limits = robot.limits.iter().map(|limit| match plant.torque_limits {
+        true => ActuatorLimits { effort: limit.effort, velocity: limit.velocity, ..ActuatorLimits::NONE },
+        false => ActuatorLimits::NONE,
+    });
+    let stance = robot.soles.iter().position(|sole| sole.name == scenario.robot.stance);
+    let pushes = scenario.push.iter().filter(|push| push.impulse_ns > 0.0);
+    Ok(PlantConfig {
+        time_step: plant.step_s,
+        errors: ModelErrors {
+            mass_scale: plant.mass_scale,
+            inertia_scale: plant.inertia_scale,
+            ..ModelErrors::default()
+        },
+        actuators: ActuatorConfig {
+            limits: limits.collect(),
+            delay: plant.actuator_delay_s,
+            ..ActuatorConfig::default()
+        },
+        sensors: sensors(&scenario.sensors),
+        pushes: pushes.map(|push| made_push(robot, push)).collect::<Result<_, _>>()?,
+        watchdog: WatchdogConfig {
+            stiffness: holding.stiffness.clone(),
+            damping: holding.damping.clone(),
+            ..WatchdogConfig::default()
+        },
+        monitor: MonitorConfig { stance_foot: stance.unwrap_or(0), ..MonitorConfig::default() },
+        seed: scenario.seed,
+        ..PlantConfig::default()
+    })
+}
+
+fn sensors(settings: &SensorSettings) -> SensorConfig {
+    let delay = settings.delay_s;
+    if settings.noise_scale == 0.0 {
+        return SensorConfig { delay, ..SensorConfig::PERFECT };
+    }
+    SensorConfig {
+        position_noise: settings.position_noise_rad,
+        position_bias: settings.position_bias_rad,
+        position_resolution: settings.position_resolution_rad,
+        velocity_noise: settings.velocity_noise_rad_s,
+        velocity_resolution: settings.velocity_resolution_rad_s,
+        base_position_noise: settings.base_position_noise_m,
+        base_orientation_noise: settings.base_orientation_noise_rad,
+        base_angular_velocity_noise: settings.gyro_noise_rad_s,
+        base_angular_velocity_bias: settings.gyro_bias_rad_s,
+        base_linear_velocity_noise: settings.base_velocity_noise_m_s,
+        force_noise: settings.foot_force_noise_n,
+        torque_noise: settings.foot_torque_noise_nm,
+        noise_scale: settings.noise_scale,
+        delay,
+    }
+}
+
+fn made_push(robot: &RobotModel, push: &PushSettings) -> Result<simulation::Push, Failure> {
+    let body = robot.link(&push.link).and_then(|link| link.body).ok_or_else(|| on_no_body(&push.link))?;
+    Ok(simulation::Push {
+        body,
+        point: robot.tree.bodies()[body].inertia.com,
+        direction_w: push.direction.into(),
+        impulse: push.impulse_ns,
+        start: push.start_s,
+        duration: push.duration_s,
+    })
+}
+
+fn on_no_body(name: &str) -> Failure {
+    Failure::Input(format!("`{name}` of the robot is fixed to the world: a plant needs it on a body that moves"))
+}

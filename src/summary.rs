@@ -1,0 +1,269 @@
+//! `summary.json`: the figures of a run, its success, and how a person reads them.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use delmpc_scenario::{Clock, Scenario};
+use serde::{Deserialize, Serialize};
+
+use crate::metrics::RobotFigures;
+
+/// What the plant process found out.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PlantPart {
+    /// The robot.
+    #[serde(flatten)]
+    pub robot: RobotFigures,
+    /// From a state to the arrival of its command; realtime only.
+    pub state_to_command_age_p50_s: Option<f64>,
+    /// The same, 99.9 %.
+    pub state_to_command_age_p999_s: Option<f64>,
+    /// Wall time of a plant step; realtime only.
+    pub plant_step_p50_s: Option<f64>,
+    /// Simulated time over wall time; realtime only.
+    pub plant_real_time_factor: Option<f64>,
+    /// Times the plant process was held up for so long that the simulated world paused; realtime only.
+    pub plant_pauses: Option<u64>,
+    /// Records the log had no room for.
+    pub log_records_dropped: u64,
+    /// Commands that were refused.
+    pub commands_refused: u64,
+    /// Worst level of the plant's own watchdog.
+    pub watchdog_level_max: u32,
+}
+
+/// What the controller process found out. Times and allocations are realtime only.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[allow(missing_docs, reason = "the names are those of the summary and say it all")]
+pub struct ControllerPart {
+    pub cycles: u64,
+    pub cycle_time_p50_s: Option<f64>,
+    pub cycle_time_p99_s: Option<f64>,
+    pub cycle_time_p999_s: Option<f64>,
+    pub cycle_time_max_s: Option<f64>,
+    pub linearize_p50_s: Option<f64>,
+    pub riccati_p50_s: Option<f64>,
+    pub qp_p50_s: Option<f64>,
+    pub qp_solves: u64,
+    pub qp_iterations_max: u32,
+    pub deadline_misses: u64,
+    pub fallback_level_max: u32,
+    pub allocations_per_cycle_max: Option<u32>,
+    /// Cycles that ended late, infeasible, with a model mismatch, with a bad state.
+    pub verdicts_late: u64,
+    pub verdicts_infeasible: u64,
+    pub verdicts_model_mismatch: u64,
+    pub verdicts_bad_state: u64,
+}
+
+/// The whole summary: flat keys, SI units.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[allow(missing_docs, reason = "the names are those of the handbook and say it all")]
+pub struct Summary {
+    pub scenario: String,
+    pub seed: u64,
+    pub success: bool,
+    pub failure: Option<String>,
+    pub clock: Clock,
+    #[serde(flatten)]
+    pub plant: Option<PlantPart>,
+    pub push_impulse_ns: Option<f64>,
+    pub push_direction: Option<[f64; 3]>,
+    pub cycle_period_s: f64,
+    #[serde(flatten)]
+    pub controller: Option<ControllerPart>,
+}
+
+impl Summary {
+    /// Puts the parts together and judges them by the scenario's criteria. `fault`: why the run broke off, if it did.
+    pub fn new(
+        scenario: &Scenario,
+        plant: Option<PlantPart>,
+        controller: Option<ControllerPart>,
+        fault: Option<String>,
+    ) -> Self {
+        let push = scenario.push.iter().max_by(|a, b| a.impulse_ns.total_cmp(&b.impulse_ns));
+        let missed = plant.as_ref().and_then(|plant| missed_criterion(scenario, plant));
+        let failure = fault.or(missed);
+        Self {
+            scenario: scenario.name.clone(),
+            seed: scenario.seed,
+            success: failure.is_none(),
+            failure,
+            clock: scenario.clock,
+            plant,
+            push_impulse_ns: push.map(|push| push.impulse_ns),
+            push_direction: push.map(|push| unit(push.direction)),
+            cycle_period_s: 1.0 / scenario.controller.mpc_rate_hz,
+            controller,
+        }
+    }
+
+    /// As a JSON object. Parts that are missing leave their keys with nothing in them.
+    pub fn to_json(&self) -> serde_json::Value {
+        let mut value = serde_json::to_value(self).unwrap_or_default();
+        if let Some(object) = value.as_object_mut() {
+            for key in KEYS {
+                object.entry(key).or_insert(serde_json::Value::Null);
+            }
+        }
+        value
+    }
+
+    /// Writes `summary.json`.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn write(&self, file: &Path) -> std::io::Result<()> {
+        let mut text = serde_json::to_string_pretty(&self.to_json())?;
+        text.push('\n');
+        std::fs::write(file, text)
+    }
+}
+
+/// The keys of the handbook, none of which may ever be missing.
+pub const KEYS: [&str; 44] = [
+    "scenario",
+    "seed",
+    "success",
+    "failure",
+    "duration_s",
+    "clock",
+    "steps",
+    "fell",
+    "fall_time_s",
+    "min_com_height_m",
+    "max_stance_slip_m",
+    "max_stance_tilt_rad",
+    "min_cop_margin_m",
+    "max_friction_use",
+    "max_torque_ratio",
+    "hand_error_at_deadline_m",
+    "hand_error_hold_max_m",
+    "push_impulse_ns",
+    "push_direction",
+    "recovered",
+    "settle_time_s",
+    "cycles",
+    "cycle_period_s",
+    "cycle_time_p50_s",
+    "cycle_time_p99_s",
+    "cycle_time_p999_s",
+    "cycle_time_max_s",
+    "linearize_p50_s",
+    "riccati_p50_s",
+    "qp_p50_s",
+    "qp_solves",
+    "qp_iterations_max",
+    "deadline_misses",
+    "fallback_level_max",
+    "state_to_command_age_p50_s",
+    "state_to_command_age_p999_s",
+    "allocations_per_cycle_max",
+    "plant_step_p50_s",
+    "plant_real_time_factor",
+    "energy_balance_error",
+    "plant_pauses",
+    "log_records_dropped",
+    "commands_refused",
+    "watchdog_level_max",
+];
+
+/// The first criterion that was missed, in words.
+fn missed_criterion(scenario: &Scenario, plant: &PlantPart) -> Option<String> {
+    let (limit, robot) = (&scenario.success, &plant.robot);
+    if limit.no_fall && robot.fell {
+        return Some(format!("the robot fell at {:.3} s", robot.fall_time_s.unwrap_or_default()));
+    }
+    if limit.no_touch_down && robot.other_foot_touched {
+        return Some("a foot that was in the air touched the ground".to_owned());
+    }
+    if robot.steps < scenario.steps() {
+        return Some(format!("the run ended after {} of {} steps", robot.steps, scenario.steps()));
+    }
+    let realtime = scenario.clock == Clock::Realtime;
+    let at_most = |key: &str, value: Option<f64>, most: f64| {
+        let value = value.filter(|value| !(*value <= most))?;
+        Some(format!("{key} = {value:.4}, allowed is at most {most}"))
+    };
+    let at_least = |key: &str, value: Option<f64>, least: f64| {
+        let value = value.filter(|value| !(*value >= least))?;
+        Some(format!("{key} = {value:.4}, needed is at least {least}"))
+    };
+    at_most("hand_error_at_deadline_m", robot.hand_error_at_deadline_m, limit.hand_error_at_deadline_m)
+        .or_else(|| at_most("hand_error_hold_max_m", robot.hand_error_hold_max_m, limit.hand_error_hold_max_m))
+        .or_else(|| at_most("max_stance_slip_m", Some(robot.max_stance_slip_m), limit.max_stance_slip_m))
+        .or_else(|| at_most("max_stance_tilt_rad", Some(robot.max_stance_tilt_rad), limit.max_stance_tilt_rad))
+        .or_else(|| at_least("min_cop_margin_m", robot.min_cop_margin_m, limit.min_cop_margin_m))
+        .or_else(|| at_most("max_torque_ratio", Some(robot.max_torque_ratio), limit.max_torque_ratio))
+        .or_else(|| (robot.recovered == Some(false)).then(|| "the robot did not come to rest after the push".to_owned()))
+        .or_else(|| at_most("settle_time_s", robot.settle_time_s, limit.settle_time_s))
+        .or_else(|| {
+            let factor = plant.plant_real_time_factor.filter(|_| realtime);
+            at_least("plant_real_time_factor", factor, limit.min_real_time_factor)
+        })
+}
+
+fn unit(direction: [f64; 3]) -> [f64; 3] {
+    let length = direction.iter().map(|x| x * x).sum::<f64>().sqrt();
+    direction.map(|x| x / length)
+}
+
+/// The summary as a person reads it.
+pub fn table(summary: &Summary, scenario: &Scenario) -> String {
+    let mut text = String::new();
+    let verdict = match &summary.failure {
+        None => "success".to_owned(),
+        Some(failure) => format!("FAILED: {failure}"),
+    };
+    let _ = writeln!(text, "{} (seed {}): {verdict}", summary.scenario, summary.seed);
+    let limit = &scenario.success;
+    let mut line = |what: &str, value: Option<String>, allowed: Option<String>| {
+        let value = value.unwrap_or_else(|| "-".to_owned());
+        let _ = match allowed {
+            Some(allowed) => writeln!(text, "  {what:<34} {value:>12}   {allowed}"),
+            None => writeln!(text, "  {what:<34} {value:>12}"),
+        };
+    };
+    let millimetres = |value: f64| format!("{:.1} mm", 1e3 * value);
+    let milliseconds = |value: f64| format!("{:.3} ms", 1e3 * value);
+    if let Some(PlantPart { robot, .. }) = &summary.plant {
+        line("simulated time", Some(format!("{:.2} s", robot.duration_s)), None);
+        let fall = robot.fall_time_s.map_or("no".to_owned(), |time| format!("at {time:.2} s"));
+        line("fall", Some(fall), None);
+        let allowed = |most: f64| Some(format!("at most {}", millimetres(most)));
+        if scenario.reach.is_some() {
+            let (deadline, hold) = (robot.hand_error_at_deadline_m, robot.hand_error_hold_max_m);
+            line("hand to ball at the deadline", deadline.map(millimetres), allowed(limit.hand_error_at_deadline_m));
+            line("hand to ball while holding", hold.map(millimetres), allowed(limit.hand_error_hold_max_m));
+        }
+        line("stance slip", Some(millimetres(robot.max_stance_slip_m)), allowed(limit.max_stance_slip_m));
+        let degrees = |radians: f64| format!("{:.3} deg", radians.to_degrees());
+        let tilt = format!("at most {}", degrees(limit.max_stance_tilt_rad));
+        line("stance tilt", Some(degrees(robot.max_stance_tilt_rad)), Some(tilt));
+        let margin = format!("at least {}", millimetres(limit.min_cop_margin_m));
+        line("pressure point to edge of sole", robot.min_cop_margin_m.map(millimetres), Some(margin));
+        line("friction used", robot.max_friction_use.map(|part| format!("{:.0} %", 100.0 * part)), None);
+        let ratio = format!("at most {:.0} %", 100.0 * limit.max_torque_ratio);
+        line("largest torque of its limit", Some(format!("{:.0} %", 100.0 * robot.max_torque_ratio)), Some(ratio));
+        if robot.recovered.is_some() {
+            let settle = robot.settle_time_s.map(|time| format!("{time:.2} s"));
+            line("push to rest", settle, Some(format!("at most {} s", limit.settle_time_s)));
+        }
+    }
+    if let Some(part) = &summary.controller {
+        line("control cycles", Some(part.cycles.to_string()), None);
+        let period = Some(format!("period {}", milliseconds(summary.cycle_period_s)));
+        line("cycle time, median", part.cycle_time_p50_s.map(milliseconds), period);
+        line("cycle time, 99.9 %", part.cycle_time_p999_s.map(milliseconds), None);
+        line("deadlines missed", Some(part.deadline_misses.to_string()), None);
+        line("QP solves", Some(part.qp_solves.to_string()), None);
+        line("worst fallback level", Some(part.fallback_level_max.to_string()), Some("0: fresh solution".to_owned()));
+    }
+    if let Some(part) = &summary.plant {
+        line("state to command, median", part.state_to_command_age_p50_s.map(milliseconds), None);
+        line("plant step, median", part.plant_step_p50_s.map(milliseconds), None);
+        line("simulated over wall time", part.plant_real_time_factor.map(|factor| format!("{factor:.3}")), None);
+    }
+    text
+}

@@ -1,0 +1,257 @@
+//! Starts the two processes of a run, watches them, ends them.
+//!
+//! | what happens | what the supervisor does |
+//! |---|---|
+//! | both say they are ready | lets the run begin |
+//! | the plant finishes | waits for the controller, then all is well |
+//! | a process ends too early, or falls silent | says so, ends the other one: fault |
+//! | Ctrl-C, SIGTERM | ends both: interrupted |
+//!
+//! A process is asked to end by the supervisor's heartbeat and by SIGTERM, and killed if it does not. Afterwards nothing of the run is left
+//! in shared memory.
+
+use std::fs::File;
+use std::io::{BufRead, BufReader, IsTerminal, Read, Write};
+use std::os::unix::process::ExitStatusExt;
+use std::path::PathBuf;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{JoinHandle, sleep};
+use std::time::Duration;
+
+use delmpc_controller_process::clock::monotonic_ns;
+use delmpc_controller_process::presence::{Peer, Presence};
+use delmpc_controller_process::stop::StopFlag;
+use delmpc_messages::{ProcessState, Role};
+use delmpc_transport::{RunId, RunNode, remove_leftovers};
+use rustix::process::{Pid, Signal, kill_process};
+
+use crate::verdict::Failure;
+
+/// Time between two looks at the processes.
+const LOOK: Duration = Duration::from_millis(5);
+/// A process may take this long to load, connect and warm up (s). Far beyond a healthy start on a busy machine.
+const START_PATIENCE_S: f64 = 60.0;
+/// A process that was asked to end is killed after this (s).
+const END_PATIENCE_S: f64 = 3.0;
+
+/// One run's two processes, and how to start them.
+#[derive(Debug)]
+pub struct Supervision {
+    /// The run.
+    pub run: RunId,
+    /// Our program.
+    pub program: PathBuf,
+    /// Arguments of each process after its role's name.
+    pub arguments: Vec<String>,
+    /// Where what the processes say is kept.
+    pub messages: PathBuf,
+    /// Whether it is shown too.
+    pub show_messages: bool,
+    /// A process that is silent for this long has failed, s.
+    pub hang_s: f64,
+}
+
+/// How the processes ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Course {
+    /// Both did all they had to.
+    Finished,
+    /// Somebody wanted it to end.
+    Interrupted,
+    /// A process failed: why.
+    Fault(String),
+}
+
+/// The numbers by which the operating system knows the processes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ProcessIds {
+    /// The plant.
+    pub plant: u32,
+    /// The controller.
+    pub controller: u32,
+}
+
+/// What one process is to its supervisor.
+struct Watched {
+    role: Role,
+    child: Child,
+    peer: Peer,
+    ended: Option<ExitStatus>,
+    listener: Option<JoinHandle<()>>,
+}
+
+impl Supervision {
+    /// Runs both processes to their end. `look` is called again and again while they run.
+    ///
+    /// # Errors
+    /// [`Failure::Fault`] when the processes cannot be started or shared memory is unusable.
+    pub fn supervise(&self, stop: &StopFlag, look: impl FnMut(ProcessIds)) -> Result<Course, Failure> {
+        let course = self.supervise_in_shared_memory(stop, look);
+        // Whatever happened, nothing stays.
+        let tidied = remove_leftovers(self.run).map_err(Failure::fault);
+        course.and_then(|course| tidied.map(|_| course))
+    }
+
+    fn supervise_in_shared_memory(
+        &self,
+        stop: &StopFlag,
+        mut look: impl FnMut(ProcessIds),
+    ) -> Result<Course, Failure> {
+        let node = RunNode::open(self.run, 0).map_err(Failure::fault)?;
+        let mut presence = Presence::new(&node, 0, Role::Supervisor).map_err(Failure::fault)?;
+        let messages = File::create(&self.messages).map_err(Failure::fault)?;
+        let messages = Arc::new(Mutex::new(messages));
+        let mut processes = Vec::new();
+        for role in [Role::Plant, Role::Controller] {
+            match self.start(&node, role, &messages) {
+                Ok(process) => processes.push(process),
+                Err(failure) => {
+                    end_all(&mut processes, &mut presence);
+                    return Err(failure);
+                }
+            }
+        }
+        let ids = ProcessIds { plant: processes[0].child.id(), controller: processes[1].child.id() };
+        let begin = monotonic_ns();
+        let course = loop {
+            if stop.is_set() {
+                break Ok(Course::Interrupted);
+            }
+            if let Err(error) = presence.beat() {
+                break Err(Failure::fault(error));
+            }
+            match self.judge(&mut processes, begin) {
+                Ok(None) => {}
+                Ok(Some(course)) => break Ok(course),
+                Err(failure) => break Err(failure),
+            }
+            let ready = |process: &Watched| process.peer.state() == Some(ProcessState::Ready);
+            if processes.iter().all(ready) {
+                if let Err(error) = presence.announce(ProcessState::Running) {
+                    break Err(Failure::fault(error));
+                }
+            }
+            look(ids);
+            sleep(LOOK);
+        };
+        end_all(&mut processes, &mut presence);
+        for process in &mut processes {
+            if let Some(listener) = process.listener.take() {
+                let _ = listener.join();
+            }
+        }
+        course
+    }
+
+    fn start(&self, node: &RunNode, role: Role, messages: &Arc<Mutex<File>>) -> Result<Watched, Failure> {
+        let peer = Peer::new(node, role).map_err(Failure::fault)?;
+        let mut child = Command::new(&self.program)
+            .arg(role.name())
+            .args(&self.arguments)
+            .args(["--run-id", &self.run.to_string(), "--supervised"])
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped())
+            .spawn()
+            .map_err(|error| Failure::Fault(format!("cannot start the {} process: {error}", role.name())))?;
+        let listener = child.stderr.take().map(|stream| {
+            let (messages, show) = (messages.clone(), self.show_messages);
+            std::thread::spawn(move || pass_on(role, stream, &messages, show))
+        });
+        Ok(Watched { role, child, peer, ended: None, listener })
+    }
+
+    /// How the run stands; `None`: it goes on.
+    fn judge(&self, processes: &mut [Watched], begin_ns: u64) -> Result<Option<Course>, Failure> {
+        let mut finished = 0;
+        for process in processes.iter_mut() {
+            // The exit first: what it said before is then already there.
+            if process.ended.is_none() {
+                process.ended = process.child.try_wait().map_err(Failure::fault)?;
+            }
+            process.peer.listen().map_err(Failure::fault)?;
+            let name = process.role.name();
+            let pid = process.child.id();
+            if let Some(status) = process.ended {
+                if status.success() && process.peer.state() == Some(ProcessState::Finished) {
+                    finished += 1;
+                    continue;
+                }
+                let how = describe(status);
+                return Ok(Some(Course::Fault(format!("the {name} process (pid {pid}) {how}"))));
+            }
+            let waited_s = (monotonic_ns() - begin_ns) as f64 * 1e-9;
+            let silent_s = process.peer.silent_s();
+            let state = process.peer.state();
+            // Loading, connecting and warming up happen in one go.
+            let starting = matches!(state, None | Some(ProcessState::Starting));
+            if starting && waited_s > START_PATIENCE_S {
+                let message = format!("the {name} process (pid {pid}) did not start within {START_PATIENCE_S} s");
+                return Ok(Some(Course::Fault(message)));
+            }
+            if !starting && silent_s > self.hang_s {
+                let message = format!(
+                    "the {name} process (pid {pid}) hangs: no sign of life for {silent_s:.1} s (limit process.hang_s = {})",
+                    self.hang_s
+                );
+                return Ok(Some(Course::Fault(message)));
+            }
+        }
+        Ok((finished == processes.len()).then_some(Course::Finished))
+    }
+}
+
+/// Asks every living process to end, and kills it if it does not.
+fn end_all(processes: &mut [Watched], presence: &mut Presence) {
+    // A broken link leaves the signals.
+    let _ = presence.announce(ProcessState::Stopping);
+    let signal = |process: &Watched, signal: Signal| {
+        if let (None, Some(pid)) = (process.ended, Pid::from_raw(process.child.id() as i32)) {
+            let _ = kill_process(pid, signal);
+        }
+    };
+    for process in processes.iter() {
+        signal(process, Signal::TERM);
+        signal(process, Signal::CONT); // a stopped process hears nothing
+    }
+    let begin = monotonic_ns();
+    loop {
+        for process in processes.iter_mut().filter(|process| process.ended.is_none()) {
+            process.ended = process.child.try_wait().unwrap_or(None);
+        }
+        let patient = (monotonic_ns() - begin) as f64 * 1e-9 < END_PATIENCE_S;
+        if !patient || processes.iter().all(|process| process.ended.is_some()) {
+            break;
+        }
+        let _ = presence.beat();
+        sleep(LOOK);
+    }
+    for process in processes.iter_mut().filter(|process| process.ended.is_none()) {
+        let _ = process.child.kill();
+        process.ended = process.child.wait().ok();
+    }
+}
+
+/// Keeps what a process says, line by line, and shows it.
+fn pass_on(role: Role, stream: impl Read, messages: &Mutex<File>, show: bool) {
+    for line in BufReader::new(stream).split(b'\n').map_while(Result::ok) {
+        let line = String::from_utf8_lossy(&line);
+        let mut file = messages.lock().unwrap_or_else(PoisonError::into_inner);
+        let _ = writeln!(file, "{}: {line}", role.name());
+        if show {
+            let mut stderr = std::io::stderr();
+            let clear = if stderr.is_terminal() { "\r\x1b[K" } else { "" };
+            let _ = writeln!(stderr, "{clear}{}: {line}", role.name());
+        }
+    }
+}
+
+fn describe(status: ExitStatus) -> String {
+    match (status.signal(), status.code()) {
+        (Some(9), _) => "was killed (signal 9)".to_owned(),
+        (Some(signal), _) => format!("ended by signal {signal}"),
+        (None, Some(0)) => "ended before its work was done".to_owned(),
+        (None, code) => format!("ended with exit status {}", code.unwrap_or_default()),
+    }
+}
