@@ -8,7 +8,7 @@ use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::Channel;
 
 use crate::cli::PartArguments;
-use crate::part::{ended, leave_part, message_run_id, prepare_machine, run_id, say};
+use crate::part::{Supervisor, ended, leave_part, message_run_id, prepare_machine, run_id, say};
 use crate::robot_controller::RobotController;
 use crate::run_folder::CONTROLLER_PART;
 use crate::setup::Setup;
@@ -20,6 +20,7 @@ use crate::verdict::{Ended, Failure};
 /// # Errors
 /// [`Failure::Input`] before anything runs, [`Failure::Fault`] when the run broke off.
 pub fn controller(arguments: &PartArguments, allocations: fn() -> u64) -> Result<Ended, Failure> {
+    let supervisor = Supervisor::of(arguments);
     let setup = Setup::read(&arguments.scenario, &arguments.set)?;
     let scenario = &setup.scenario;
     let run = run_id(arguments, &setup)?;
@@ -42,6 +43,8 @@ pub fn controller(arguments: &PartArguments, allocations: fn() -> u64) -> Result
     }
     let (ending, figures) =
         controller_loop.run(&mut controller, &mut membership).map_err(Failure::fault)?;
+    drop(membership);
+    supervisor.stand_in(run);
     leave_part(arguments.out.as_deref(), CONTROLLER_PART, &part(scenario, &figures))?;
     ended(ending, "plant")
 }

@@ -7,9 +7,9 @@ use serde::{Deserialize, Serialize};
 use crate::truth::Truth;
 
 /// At rest: the mass centre is horizontally this close to where it began (m) ...
-const REST_DISTANCE_M: f64 = 0.02;
+const REST_DISTANCE_M: f64 = 0.01;
 /// ... and slower than this (m/s).
-const REST_SPEED_M_S: f64 = 0.05;
+const REST_SPEED_M_S: f64 = 0.02;
 
 /// Collects the figures step by step. No allocation.
 #[derive(Debug, Clone)]
@@ -232,9 +232,9 @@ mod tests {
         let mut metrics = Metrics::new(&scenario());
         (0..=300).for_each(|k| metrics.observe(&truth(k)));
         let figures = metrics.figures();
-        // 0.4 exp(-t/0.2) = 0.05
+        // 0.4 exp(-t/0.2) = 0.02
         assert_eq!(figures.recovered, Some(true));
-        assert!((figures.settle_time_s.unwrap() - 0.2 * 8.0_f64.ln()).abs() < 0.011);
+        assert!((figures.settle_time_s.unwrap() - 0.2 * 20.0_f64.ln()).abs() < 0.011);
     }
 
     #[test]

@@ -8,7 +8,8 @@ use delmpc_controller_process::machine::prepare;
 use delmpc_controller_process::membership::Order;
 use delmpc_messages::{JointSetHasher, Role};
 use delmpc_scenario::{Clock, Scenario};
-use delmpc_transport::RunId;
+use delmpc_transport::{RunId, remove_leftovers};
+use rustix::process::{Pid, getppid};
 use serde::Serialize;
 
 use crate::cli::PartArguments;
@@ -46,6 +47,25 @@ pub fn prepare_machine(role: Role, scenario: &Scenario) {
         };
         for warning in prepare(&scenario.process, core) {
             say(&format!("warning: {warning}"));
+        }
+    }
+}
+
+/// Who supervises this process, as long as it lives.
+#[derive(Debug, Clone, Copy)]
+pub struct Supervisor(Option<Pid>);
+
+impl Supervisor {
+    /// The parent of a supervised process.
+    pub fn of(arguments: &PartArguments) -> Self {
+        Self(arguments.supervised.then(getppid).flatten())
+    }
+
+    /// Does the last duty of a supervisor where there is none, or none any more: removes what the run left. Call it when all that belongs to
+    /// the run is dropped; the last process to do so succeeds.
+    pub fn stand_in(self, run: RunId) {
+        if self.0.is_none() || getppid() != self.0 {
+            let _ = remove_leftovers(run);
         }
     }
 }

@@ -9,9 +9,9 @@ use delmpc_transport::{Channel, RunId};
 
 use crate::cli::PartArguments;
 use crate::log::Log;
-use crate::part::{ended, leave_part, message_run_id, prepare_machine, run_id, say};
+use crate::part::{Supervisor, ended, leave_part, message_run_id, prepare_machine, run_id, say};
 use crate::plant_process::PlantLoop;
-use crate::run_folder::PLANT_PART;
+use crate::run_folder::{PLANT_PART, ROBOT_FILE};
 use crate::setup::Setup;
 use crate::simulated_robot::SimulatedRobot;
 use crate::verdict::{Ended, Failure};
@@ -21,6 +21,7 @@ use crate::verdict::{Ended, Failure};
 /// # Errors
 /// [`Failure::Input`] before anything runs, [`Failure::Fault`] when the run broke off.
 pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
+    let supervisor = Supervisor::of(arguments);
     let setup = Setup::read(&arguments.scenario, &arguments.set)?;
     let scenario = &setup.scenario;
     let run = run_id(arguments, &setup)?;
@@ -44,13 +45,16 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
     let plant_loop = PlantLoop::new(scenario, states, commands, &blank, log);
     let (ending, mut part, log) = plant_loop.run(&mut robot, &mut membership).map_err(Failure::fault)?;
     part.log_records_dropped = log.finish()?;
+    drop(membership);
+    supervisor.stand_in(run);
     leave_part(arguments.out.as_deref(), PLANT_PART, &part)?;
     ended(ending, "controller")
 }
 
 /// What the log says about its run. In lockstep only what is the same in every run of the seed.
 pub fn about(setup: &Setup, run: RunId) -> BTreeMap<String, String> {
-    let scenario = &setup.scenario;
+    let mut scenario = setup.scenario.clone();
+    scenario.robot.urdf = ROBOT_FILE.to_owned();
     let mut about = BTreeMap::from([
         ("program".to_owned(), concat!("delmpc ", env!("CARGO_PKG_VERSION")).to_owned()),
         ("scenario".to_owned(), scenario.name.clone()),

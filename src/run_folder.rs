@@ -21,6 +21,8 @@ use crate::verdict::Failure;
 
 /// Files of an earlier run that would be taken for results of this one.
 const RESULTS: [&str; 5] = ["summary.json", "log.mcap", "messages.txt", PLANT_PART, CONTROLLER_PART];
+/// The robot.
+pub const ROBOT_FILE: &str = "robot.urdf";
 /// What the plant process found out; part of the summary.
 pub const PLANT_PART: &str = "plant.json";
 /// What the controller process found out; part of the summary.
@@ -90,9 +92,9 @@ impl RunFolder {
     pub fn write_inputs(&self, setup: &Setup) -> Result<(), Failure> {
         let cannot = |error| Failure::Input(format!("{}: {error}", self.path.display()));
         let mut scenario: Scenario = setup.scenario.clone();
-        scenario.robot.urdf = "robot.urdf".to_owned();
+        scenario.robot.urdf = ROBOT_FILE.to_owned();
         fs::write(self.file("scenario.toml"), scenario.to_toml()).map_err(cannot)?;
-        copy(&setup.urdf, &self.file("robot.urdf")).map_err(cannot)?;
+        copy(&setup.urdf, &self.file(ROBOT_FILE)).map_err(cannot)?;
         let companion = setup.urdf.with_extension("toml");
         if companion.is_file() {
             copy(&companion, &self.file("robot.toml")).map_err(cannot)?;

@@ -1,5 +1,7 @@
 //! Time of one plant step of Atlas on both feet, and of its parts: `cargo bench -p delmpc-plant`.
 
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
+
 #[path = "../tests/atlas/mod.rs"]
 mod atlas;
 #[path = "../tests/common/mod.rs"]
@@ -18,7 +20,6 @@ use delmpc_plant::prelude::*;
 fn time(what: &str, calls: usize, mut call: impl FnMut()) {
     let mut times: Vec<f64> = (0..calls)
         .map(|_| {
-            #[allow(clippy::disallowed_methods)]
             let start = Instant::now();
             call();
             start.elapsed().as_secs_f64() * 1e6

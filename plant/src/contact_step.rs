@@ -26,48 +26,28 @@
 //! Source: ours, measured against impulse-at-the-start formulations. The cone law on velocities is J. J. Moreau, *Unilateral
 //! contact and dry friction in finite freedom dynamics*, 1988.
 
-use delmpc_mechanics::branch_lu::BranchLu;
 use delmpc_mechanics::del_residual::{DelWorkspace, ForceCapacity};
 use delmpc_mechanics::errors::{ModelError, StepError};
 use delmpc_mechanics::forces::{PointForce, StepForces};
 use delmpc_mechanics::load_response::{BoundaryMotion, LoadPoint, LoadResponse};
 use delmpc_mechanics::lobatto::LobattoRule;
-use delmpc_mechanics::newton_direction::NewtonDirection;
-use delmpc_mechanics::spatial::{Wrench, exp_rotation};
+use delmpc_mechanics::spatial::Wrench;
 use delmpc_mechanics::state::State;
-use delmpc_mechanics::tree::{JointKind, KinematicTree};
+use delmpc_mechanics::tree::KinematicTree;
 use nalgebra::{Matrix3, Vector3};
 
 use crate::contact_law::{ContactLaw, ContactProblem, LawPath, LawReport, Regularisation};
 use crate::dense::largest;
 use crate::error::{PlantError, require, require_length};
+use crate::step_newton::StepNewton;
 use crate::terrain::Terrain;
 
-/// The next change of the nodes is predicted below this (times `1 + max|q|`): converged.
-const PREDICTED_CHANGE: f64 = 1e-14;
-/// A change below this (times `1 + max|q|`) is converged without prediction.
-const SMALL_CHANGE: f64 = 1e-13;
-/// A change below this (times `1 + max|q|`) is round-off: the nodes stay as they were evaluated.
-const NO_CHANGE: f64 = 1e-15;
-/// Below this the iteration may stop when it no longer shrinks.
-const STAGNATION_CHANGE: f64 = 1e-9;
-/// Contraction above which the Newton matrix is renewed.
-const RENEW_CONTRACTION: f64 = 0.1;
-/// Newton iterations per round after which a step fails.
-const MAX_ITERATIONS: usize = 30;
-/// A revolute joint that ends further (rad) from its guess is a spurious solution.
-const TURN_LIMIT: f64 = 1.0;
 /// Reach of the candidate test, m.
 const CANDIDATE_MARGIN: f64 = 1e-4;
 /// Rounds of a step after which factors and `W` are computed again.
 const ROUNDS_PER_RESPONSE: usize = 4;
 /// Change of the velocities, relative, after which they are: an impact.
 const LARGE_CHANGE: f64 = 0.2;
-/// Steps after which they are.
-const MAX_FACTOR_AGE: usize = 20;
-/// Contraction of Newton's method in a step after which they are for the next one.
-const AGED_CONTRACTION: f64 = 0.02;
-
 /// A point of the robot that may touch the ground.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ContactPoint {
@@ -182,23 +162,16 @@ pub struct ContactStep {
     contacts: Vec<ContactPoint>,
     points: Vec<LoadPoint>,
     results: Vec<ContactResult>,
-    del: DelWorkspace,
-    solver: BranchLu,
+    newton: StepNewton,
     response: LoadResponse,
     law: ContactLaw,
     start: BoundaryMotion,
     end: BoundaryMotion,
     next: State,
     has_previous: bool,
-    previous_nodes: Vec<f64>,
-    extrapolation: Vec<f64>,
-    guessed_end: Vec<f64>,
-    direction: Vec<f64>,
-    /// Contraction seen with the present factors in this step.
-    contraction: f64,
-    /// Steps since the factorisation.
-    factor_age: usize,
-    /// Contacts `W` was computed for with the present factors; empty for none.
+    /// Factorisation `W` was computed with.
+    response_generation: u64,
+    /// Contacts `W` was computed for; empty for none.
     response_of: Vec<usize>,
     candidates: Vec<Candidate>,
     loads: Vec<LoadPoint>,
@@ -230,14 +203,7 @@ impl ContactStep {
         let rule = LobattoRule::new(options.unknown_nodes)?;
         let capacity = options.max_candidates.min(contacts.len()).max(1);
         let force_capacity = ForceCapacity { points: capacity + options.max_pushes, laws: false };
-        let del = DelWorkspace::new(tree, &rule, time_step, force_capacity)?;
-        let solver = BranchLu::new(tree, &del);
-        let nodes = rule.nodes().len();
-        let extrapolation = rule
-            .nodes()
-            .iter()
-            .flat_map(|c| (0..nodes).map(|beta| rule.lagrange(beta, 1.0 + c)).collect::<Vec<_>>())
-            .collect();
+        let newton = StepNewton::new(tree, &rule, time_step, force_capacity)?;
         let points = contacts
             .iter()
             .map(|contact| LoadPoint {
@@ -245,7 +211,7 @@ impl ContactStep {
                 point_b: contact.point - tree.bodies()[contact.body].inertia.com,
             })
             .collect();
-        let (dof, n) = (tree.dof(), 3 * capacity);
+        let n = 3 * capacity;
         Ok(Self {
             options,
             time_step,
@@ -255,18 +221,13 @@ impl ContactStep {
             contacts: contacts.to_vec(),
             points,
             results: vec![ContactResult::default(); contacts.len()],
-            response: LoadResponse::new(tree, &del, &solver, capacity),
+            response: LoadResponse::new(tree, &newton.del, &newton.solver, capacity),
             law: ContactLaw::new(capacity, options.regularisation)?,
             start: BoundaryMotion::new(tree),
             end: BoundaryMotion::new(tree),
             next: State::zeros(tree),
             has_previous: false,
-            previous_nodes: vec![0.0; nodes * dof],
-            extrapolation,
-            guessed_end: vec![0.0; dof],
-            direction: vec![0.0; options.unknown_nodes * dof],
-            contraction: 1.0,
-            factor_age: MAX_FACTOR_AGE,
+            response_generation: 0,
             response_of: Vec::with_capacity(capacity),
             candidates: Vec::with_capacity(contacts.len()),
             loads: Vec::with_capacity(capacity),
@@ -280,8 +241,7 @@ impl ContactStep {
             impulse: vec![0.0; n],
             new_impulse: vec![0.0; n],
             scratch: vec![0.0; n],
-            del,
-            solver,
+            newton,
         })
     }
 
@@ -329,14 +289,9 @@ impl ContactStep {
         self.load_impulses();
         self.set_forces(pushes);
         let forces = StepForces::held(joint_forces).with_points(&self.forces);
-        self.del.begin(tree, state, &forces)?;
+        self.newton.del.begin(tree, state, &forces)?;
         let mut report = ContactReport { candidates: self.candidates.len(), ..ContactReport::default() };
-        self.contraction = 1.0;
-        self.factor_age = if continues { self.factor_age + 1 } else { MAX_FACTOR_AGE };
-        self.first_newton(tree, state, continues, &mut report)?;
-        if self.contraction > AGED_CONTRACTION && self.contraction < 1.0 {
-            self.factor_age = MAX_FACTOR_AGE;
-        }
+        self.newton.solve_first(tree, state, self.start.velocity(), continues)?;
         if self.candidates.is_empty() {
             report.rounds = 1;
             report.converged = true;
@@ -345,6 +300,8 @@ impl ContactStep {
             self.rounds(tree, pushes.len(), &mut report)?;
         }
         self.keep(tree);
+        report.iterations = self.newton.iterations;
+        report.factorizations = self.newton.factorizations;
         Ok(report)
     }
 
@@ -352,7 +309,7 @@ impl ContactStep {
     pub fn forget(&mut self) {
         self.has_previous = false;
         self.response_of.clear();
-        self.factor_age = MAX_FACTOR_AGE;
+        self.newton.forget();
         self.results.fill(ContactResult::default());
     }
 
@@ -412,7 +369,7 @@ impl ContactStep {
 
     /// The nodes of the last solved step.
     pub fn del(&self) -> &DelWorkspace {
-        &self.del
+        &self.newton.del
     }
 
     /// Time step, s.
@@ -557,13 +514,13 @@ impl ContactStep {
             if !keep {
                 rounds_left = ROUNDS_PER_RESPONSE;
             }
-            self.newton(tree, report, keep)?;
+            self.newton.iterate(tree, keep)?;
         }
     }
 
     fn response_is_current(&self) -> bool {
         let candidates = self.candidates.iter().map(|candidate| candidate.contact);
-        !self.response_of.is_empty() && self.response_of.iter().copied().eq(candidates)
+        self.response_generation == self.newton.generation && self.response_of.iter().copied().eq(candidates)
     }
 
     /// `W` in the contact frames.
@@ -572,7 +529,7 @@ impl ContactStep {
         let n = 3 * m;
         let s = self.options.unknown_nodes;
         self.response_of.clear();
-        self.response.solve(tree, &self.del, &mut self.solver, &self.loads)?;
+        self.response.solve(tree, &self.newton.del, &mut self.newton.solver, &self.loads)?;
         let world = &mut self.response_w[..n * n];
         self.response.velocity_response_into(tree, &mut self.end, s, &self.loads, world)?;
         for i in 0..m {
@@ -588,6 +545,7 @@ impl ContactStep {
                 }
             }
         }
+        self.response_generation = self.newton.generation;
         self.response_of.extend(self.candidates.iter().map(|candidate| candidate.contact));
         Ok(())
     }
@@ -627,7 +585,7 @@ impl ContactStep {
             self.impulse[3 * i..3 * i + 3].copy_from_slice(&self.new_impulse[3 * i..3 * i + 3]);
             let after = self.impulse_w(i);
             self.scratch[3 * i..3 * i + 3].copy_from_slice((after - before).as_slice());
-            self.del.set_point_force(pushes + i, &(after / self.time_step))?;
+            self.newton.del.set_point_force(pushes + i, &(after / self.time_step))?;
         }
         let s = self.options.unknown_nodes;
         if let Some(nodes) = self.response.nodes() {
@@ -635,7 +593,7 @@ impl ContactStep {
                 for alpha in 1..=s {
                     let row = dof * s + alpha - 1;
                     let change: f64 = (0..3 * m).map(|c| nodes.get(row, c) * self.scratch[c]).sum();
-                    self.del.move_node(alpha, dof, change);
+                    self.newton.del.move_node(alpha, dof, change);
                 }
             }
         }
@@ -644,165 +602,14 @@ impl ContactStep {
 
     /// The state and the motion at the end of the step, from the nodes.
     fn finish_nodes(&mut self, tree: &KinematicTree) -> Result<(), StepError> {
-        self.del.next_state_into(tree, &mut self.next);
+        self.newton.del.next_state_into(tree, &mut self.next);
         self.end.update(tree, &self.next)
-    }
-
-    fn first_newton(
-        &mut self,
-        tree: &KinematicTree,
-        state: &State,
-        continues: bool,
-        report: &mut ContactReport,
-    ) -> Result<(), StepError> {
-        if continues {
-            self.guess_by_extrapolation(tree);
-            if self.newton(tree, report, self.factor_age < MAX_FACTOR_AGE).is_ok() {
-                return Ok(());
-            }
-        }
-        self.guess_by_velocity(tree, state);
-        self.newton(tree, report, false)
-    }
-
-    fn guess_by_extrapolation(&mut self, tree: &KinematicTree) {
-        let count = self.options.unknown_nodes + 1;
-        for dof in 0..tree.dof() {
-            let nodes = &self.previous_nodes[dof * count..(dof + 1) * count];
-            for alpha in 1..count {
-                let value = if dof < tree.base_dof() {
-                    // The chart moves with the body: the same rotation and travel once more.
-                    nodes[alpha]
-                } else {
-                    let row = &self.extrapolation[alpha * count..(alpha + 1) * count];
-                    row.iter().zip(nodes).map(|(l, q)| l * q).sum()
-                };
-                self.del.set_node(alpha, dof, value);
-            }
-        }
-    }
-
-    fn guess_by_velocity(&mut self, tree: &KinematicTree, state: &State) {
-        let dt = self.time_step;
-        let rate = self.start.velocity();
-        let mut half = [0.0; 6];
-        if tree.is_floating() {
-            let omega = Vector3::new(rate[0], rate[1], rate[2]);
-            let linear = Vector3::new(rate[3], rate[4], rate[5]);
-            let pose = &state.base_pose;
-            let turn = pose.rotation.tr_mul(&omega) * (0.5 * dt);
-            let center = pose.rotation * exp_rotation(&turn);
-            let travel = center.tr_mul(&(linear + omega.cross(&pose.translation))) * (0.5 * dt);
-            half = [turn.x, turn.y, turn.z, travel.x, travel.y, travel.z];
-        }
-        for alpha in 1..=self.options.unknown_nodes {
-            let c = self.del.rule().nodes()[alpha];
-            for dof in 0..tree.dof() {
-                let value = if dof < tree.base_dof() {
-                    (2.0 * c - 1.0) * half[dof]
-                } else {
-                    state.q[dof - tree.base_dof()] + c * dt * rate[dof]
-                };
-                self.del.set_node(alpha, dof, value);
-            }
-        }
-    }
-
-    /// Newton's method from the nodes in `del`, which it leaves evaluated at the solution.
-    fn newton(
-        &mut self,
-        tree: &KinematicTree,
-        report: &mut ContactReport,
-        keep_factors: bool,
-    ) -> Result<(), StepError> {
-        let s = self.options.unknown_nodes;
-        for (dof, end) in self.guessed_end.iter_mut().enumerate() {
-            *end = self.del.node(s, dof);
-        }
-        let mut renew = !keep_factors;
-        let (mut residual, mut last_change) = (f64::INFINITY, f64::INFINITY);
-        for iteration in 0..MAX_ITERATIONS {
-            self.del.evaluate(tree, &[]);
-            self.del.residual_into(tree, &mut self.direction);
-            residual = largest(&self.direction);
-            if let Some(index) = self.direction.iter().position(|x| !x.is_finite()) {
-                return Err(StepError::NonFinite { quantity: "DEL residual (coordinate * s + node)", index });
-            }
-            if renew {
-                self.response_of.clear();
-                self.factor_age = MAX_FACTOR_AGE;
-                self.solver.factor(tree, &self.del)?;
-                self.factor_age = 0;
-                report.factorizations += 1;
-                self.contraction = 1.0;
-            }
-            self.solver.solve(tree, &mut self.direction);
-            report.iterations += 1;
-            let change = largest(&self.direction);
-            if !change.is_finite() {
-                return Err(StepError::NotConverged { residual, change, iterations: report.iterations });
-            }
-            let size = 1.0 + self.largest_joint_node(tree);
-            if change <= NO_CHANGE * size {
-                return self.accept(tree);
-            }
-            for dof in 0..tree.dof() {
-                for alpha in 1..=s {
-                    self.del.move_node(alpha, dof, -self.direction[dof * s + alpha - 1]);
-                }
-            }
-            let contraction = change / last_change;
-            if iteration > 0 {
-                self.contraction = contraction.max(1e-8);
-            }
-            if change <= SMALL_CHANGE * size
-                || change * self.contraction <= PREDICTED_CHANGE * size
-                || (change <= STAGNATION_CHANGE * size && iteration > 0 && contraction > 0.5)
-            {
-                self.del.evaluate(tree, &[]);
-                return self.accept(tree);
-            }
-            renew = iteration > 0 && contraction > RENEW_CONTRACTION;
-            last_change = change;
-        }
-        Err(StepError::NotConverged { residual, change: last_change, iterations: report.iterations })
-    }
-
-    fn largest_joint_node(&self, tree: &KinematicTree) -> f64 {
-        let s = self.options.unknown_nodes;
-        (tree.base_dof()..tree.dof()).map(|dof| self.del.node(s, dof).abs()).fold(0.0, f64::max)
-    }
-
-    /// Refuses solutions that are not the continuation of the motion.
-    fn accept(&self, tree: &KinematicTree) -> Result<(), StepError> {
-        let s = self.options.unknown_nodes;
-        if tree.is_floating() {
-            let half = (0..3).map(|k| self.del.node(s, k).powi(2)).sum::<f64>().sqrt();
-            let limit = core::f64::consts::FRAC_PI_2;
-            if half > limit {
-                return Err(StepError::SpuriousSolution { dof: 0, change: 2.0 * half, limit: 2.0 * limit });
-            }
-        }
-        for (body, spec) in tree.bodies().iter().enumerate().skip(tree.first_joint_body()) {
-            if spec.joint.kind == JointKind::Revolute {
-                let dof = tree.joint_dof(body);
-                let change = (self.del.node(s, dof) - self.guessed_end[dof]).abs();
-                if change > TURN_LIMIT {
-                    return Err(StepError::SpuriousSolution { dof, change, limit: TURN_LIMIT });
-                }
-            }
-        }
-        Ok(())
     }
 
     /// Stores nodes and impulses for the next step, and what happened at the contacts.
     fn keep(&mut self, tree: &KinematicTree) {
         let count = self.options.unknown_nodes + 1;
-        for dof in 0..tree.dof() {
-            for alpha in 0..count {
-                self.previous_nodes[dof * count + alpha] = self.del.node(alpha, dof);
-            }
-        }
+        self.newton.keep_nodes(tree);
         self.has_previous = true;
         for (point, result) in self.points.iter().zip(&mut self.results) {
             result.end_w = self.end.point_w(point);
@@ -811,8 +618,8 @@ impl ContactStep {
             result.touching = false;
             result.mean_point_w = Vector3::zeros();
             for alpha in 0..count {
-                let weight = self.del.rule().weights()[alpha];
-                let pose = self.del.body_pose(point.body, alpha);
+                let weight = self.newton.del.rule().weights()[alpha];
+                let pose = self.newton.del.body_pose(point.body, alpha);
                 result.mean_point_w += pose.transform_point(&point.point_b) * weight;
             }
         }

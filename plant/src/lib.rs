@@ -48,6 +48,7 @@ pub mod plant;
 pub mod random;
 pub mod sensors;
 pub mod servo;
+pub(crate) mod step_newton;
 pub mod terrain;
 
 /// What most users need.

@@ -195,7 +195,7 @@ impl Servo {
     /// [`PlantError`] for times out of range or lists of the wrong length.
     pub fn new(joints: usize, joint_set_hash: u64, config: WatchdogConfig) -> Result<Self, PlantError> {
         for time in [config.hold_gains, config.static_law, config.gravity_hold, config.damping_only] {
-            require(time >= 0.0 && time < 1e9, "watchdog time", time, "in [0, 1e9) s")?;
+            require((0.0..1e9).contains(&time), "watchdog time", time, "in [0, 1e9) s")?;
         }
         let mut config = config;
         for list in [&mut config.stiffness, &mut config.damping] {

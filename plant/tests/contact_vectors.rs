@@ -1,4 +1,5 @@
 //! The contact law against the reference implementation's vectors.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod common;
 

@@ -1,4 +1,5 @@
 //! A leg on springs: order while it sticks, order in flight, response matrix of a floating tree, landing.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod common;
 

@@ -1,4 +1,5 @@
 //! Atlas in the plant: standing, pushed, without torque; determinism.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod atlas;
 mod common;
@@ -22,7 +23,6 @@ fn a_standing_robot_creeps_less_than_a_tenth_of_a_millimetre_in_ten_seconds() {
     let mut times = Vec::with_capacity(10_000);
     let (mut rounds, mut iterations, mut factorizations, mut cones) = (0, 0, 0, 0);
     for _ in 0..10_000 {
-        #[allow(clippy::disallowed_methods)]
         let before = Instant::now();
         let step = plant.step().unwrap();
         times.push(before.elapsed().as_secs_f64());
@@ -117,6 +117,40 @@ fn a_push_gives_its_impulse_and_energy_is_accounted_for() {
     assert_eq!(disturbed, 100);
     assert!(totals.push_work.abs() > 1e-3);
     assert!(totals.energy_balance_error().abs() < 1e-3 * totals.energy_moved.max(1.0));
+}
+
+#[test]
+fn a_hard_push_knocks_the_robot_over() {
+    let robot = atlas::load();
+    let config = PlantConfig {
+        pushes: vec![push(&robot, 120.0)],
+        actuators: ActuatorConfig { limits: atlas::limits(&robot), ..ActuatorConfig::default() },
+        ..PlantConfig::default()
+    };
+    let mut plant = atlas::standing(&robot, config);
+    let mut deepest = 0.0;
+    for _ in 0..4000 {
+        let step = plant.step().unwrap();
+        if plant.monitor().totals().max_penetration > deepest + 1e-6 {
+            deepest = plant.monitor().totals().max_penetration;
+            let speeds: Vec<f64> = plant.contact().results().iter().filter(|r| r.candidate).map(|r| r.velocity_w.z).collect();
+            println!("{:.3} {deepest:.1e} {:?} {:?}", plant.time(), step.contact, speeds);
+        }
+        if plant.monitor().totals().fall.is_some() {
+            break;
+        }
+    }
+    let totals = plant.monitor().totals();
+    println!(
+        "{:?}; {} unconverged, penetration {:.1e} m, feet {:?}",
+        totals.fall,
+        totals.unconverged_steps,
+        totals.max_penetration,
+        plant.monitor().reports().iter().map(|foot| (foot.touch_downs, foot.slip)).collect::<Vec<_>>()
+    );
+    let (time, _) = totals.fall.unwrap();
+    assert!(time > 0.6);
+    assert!(totals.max_penetration < 1e-4);
 }
 
 fn run(seed: u64) -> (Vec<u64>, Vec<u8>) {

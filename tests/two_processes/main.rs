@@ -126,7 +126,7 @@ fn when_the_supervisor_is_killed_its_processes_end() {
     wait_for("the processes to end", || {
         family.iter().all(|child| !support::is_alive(child.pid)).then_some(())
     });
-    support::tidy(&family[0].run_id);
+    assert_nothing_left(&family);
 }
 
 #[test]
@@ -144,11 +144,13 @@ fn two_processes_of_the_same_scenario_meet_whichever_starts_first() {
         let early = start(first);
         std::thread::sleep(std::time::Duration::from_millis(500));
         let late = start(second);
+        let mut run_id = String::new();
         for process in [early, late] {
             let ended = process.wait();
             assert_eq!(ended.status, Some(0), "{first} first: {}", ended.errors);
-            support::tidy(&ended.run_id());
+            run_id = ended.run_id();
         }
+        assert_eq!(shared_memory_of(&run_id), Vec::<String>::new());
     }
 }
 

@@ -175,11 +175,6 @@ pub fn shared_memory_of(run_id: &str) -> Vec<String> {
     names
 }
 
-/// Removes what a run without a supervisor leaves.
-pub fn tidy(run_id: &str) {
-    let _ = delmpc_transport::remove_leftovers(run_id.parse().unwrap());
-}
-
 /// Asks again and again until there is an answer.
 pub fn wait_for<R>(what: &str, mut ask: impl FnMut() -> Option<R>) -> R {
     let begin = Instant::now();

@@ -429,10 +429,10 @@ impl Controller {
                 .map_err(|_| reason::STAGE)?;
             stage.hessian.fill(0.0);
             stage.gradient.fill(0.0);
-            for j in 0..n {
+            for (j, (u, carried)) in u.iter().zip(&self.gravity_torque).enumerate() {
                 let weight = self.torque_weight[j] * duration;
                 stage.hessian[(j, j)] = weight;
-                stage.gradient[j] = weight * (u[j] - self.gravity_torque[j]);
+                stage.gradient[j] = weight * (u - carried);
             }
             let hessian = stage.hessian.as_mut().submatrix_mut(n, n, 2 * n, 2 * n);
             let gradient = &mut stage.gradient[n..];

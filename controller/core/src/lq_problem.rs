@@ -231,56 +231,27 @@ impl LqProblem {
     ) {
         let LqSize { states, inputs, stages, .. } = self.size;
         for node in 0..=stages {
-            let mut index = 0u16;
-            let mut check = |violation: f64, scale: f64| {
+            let id = |index: usize| RowId { stage: node as u16, index: index as u16 };
+            let mut check = |index: usize, violation: f64, scale: f64| {
                 if violation > threshold * scale {
-                    visit(RowId { stage: node as u16, index }, violation, scale);
+                    visit(id(index), violation, scale);
                 }
-                index += 1;
             };
-            match self.stages.get(node) {
-                Some(stage) => {
-                    let own = u.col_as_slice(node);
-                    for i in 0..inputs {
-                        check(own[i] - stage.input.upper[i], self.input_tags[i].scale);
-                    }
-                    for i in 0..inputs {
-                        check(stage.input.lower[i] - own[i], self.input_tags[i].scale);
-                    }
-                }
-                None => index += 2 * inputs as u16,
+            if let Some(stage) = self.stages.get(node) {
+                visit_box(u.col_as_slice(node), &stage.input, &self.input_tags, 0, &mut check);
             }
-            let mut check = |violation: f64, scale: f64| {
-                if violation > threshold * scale {
-                    visit(RowId { stage: node as u16, index }, violation, scale);
-                }
-                index += 1;
-            };
             if node > 0 {
-                let (own, bounds) = (x.col_as_slice(node), self.state_bounds(node));
-                for i in 0..states {
-                    check(own[i] - bounds.upper[i], self.state_tags[i].scale);
-                }
-                for i in 0..states {
-                    check(bounds.lower[i] - own[i], self.state_tags[i].scale);
-                }
-            } else {
-                index += 2 * states as u16;
+                let bounds = self.state_bounds(node);
+                visit_box(x.col_as_slice(node), bounds, &self.state_tags, 2 * inputs, &mut check);
             }
+            let general = 2 * (inputs + states);
             let Some(stage) = self.stages.get(node) else { continue };
             let values = &mut values[..stage.row_count];
             let rows = stage.rows.as_ref().subcols(0, stage.row_count).transpose();
             gemv(values, Accum::Replace, rows.subcols(0, inputs), u.col_as_slice(node), 1.0);
             gemv(values, Accum::Add, rows.subcols(inputs, states), x.col_as_slice(node), 1.0);
             for (i, value) in values.iter().enumerate() {
-                let violation = value - stage.row_bound[i];
-                if violation > threshold * stage.row_tag[i].scale {
-                    visit(
-                        RowId { stage: node as u16, index: index + i as u16 },
-                        violation,
-                        stage.row_tag[i].scale,
-                    );
-                }
+                check(general + i, value - stage.row_bound[i], stage.row_tag[i].scale);
             }
         }
     }
@@ -301,6 +272,22 @@ impl LqProblem {
             index -= states;
         }
         RowPart::General { index }
+    }
+}
+
+/// Calls `check(index, violation, scale)` for the upper bounds, then the lower ones.
+fn visit_box(
+    values: &[f64],
+    bounds: &BoxBounds,
+    tags: &[RowTag],
+    first: usize,
+    check: &mut impl FnMut(usize, f64, f64),
+) {
+    for (i, ((value, upper), tag)) in values.iter().zip(&bounds.upper).zip(tags).enumerate() {
+        check(first + i, value - upper, tag.scale);
+    }
+    for (i, ((value, lower), tag)) in values.iter().zip(&bounds.lower).zip(tags).enumerate() {
+        check(first + values.len() + i, lower - value, tag.scale);
     }
 }
 

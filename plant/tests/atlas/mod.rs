@@ -75,9 +75,11 @@ pub fn standing(robot: &RobotModel, config: PlantConfig) -> Plant {
         unit[6 + joint] = 1.0;
         motion.factor().solve_in_place(&mut unit).unwrap();
         let inertia = 1.0 / unit[6 + joint];
+        // A foot in the air is as light as a hand, but the ankles must carry.
+        let (most_stiffness, most_damping) = (0.5e6 * inertia, 300.0 * inertia);
         let carries = name.contains("leg") || name.contains("back");
-        stiffness.push(if carries { 3000.0 } else { inertia * 3600.0 });
-        damping.push(if carries { 60.0 } else { inertia * 84.0 });
+        stiffness.push(if carries { most_stiffness.min(3000.0) } else { inertia * 3600.0 });
+        damping.push(if carries { most_damping.min(60.0) } else { inertia * 84.0 });
     }
     let law = AffineLaw::joint_stiffness(&torque, &state.q, &stiffness, &damping);
     let watchdog = WatchdogConfig { law: Some(law), ..WatchdogConfig::default() };

@@ -2,6 +2,7 @@
 //!
 //! `cargo bench -p delmpc-mechanics --bench speed`. Every figure is the median over batches; inputs are built and seeded outside
 //! the loop. Times depend on the machine: quote them with it.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 #[path = "../tests/oracle/mod.rs"]
 mod oracle;

@@ -128,6 +128,9 @@ struct Term {
     direction_w: Vector3<f64>,
 }
 
+/// At most two features with their directions, and the constant.
+type RowSpec = ([Option<(usize, Vector3<f64>)>; 2], f64);
+
 /// The rows of all constraints of a tree.
 #[derive(Clone, Debug)]
 pub struct ConstraintSet {
@@ -158,7 +161,7 @@ impl ConstraintSet {
 
     fn add(&mut self, tree: &KinematicTree, constraint: &Constraint) -> Result<(), ModelError> {
         // Rows as (feature, direction) lists and constants, before the mask.
-        let mut rows: [([Option<(usize, Vector3<f64>)>; 2], f64); 6] = [([None; 2], 0.0); 6];
+        let mut rows: [RowSpec; 6] = [([None; 2], 0.0); 6];
         let count = match constraint.kind {
             ConstraintKind::Point { body, point, target_w } => {
                 let feature = self.feature(tree, body, point, false)?;
@@ -859,8 +862,7 @@ impl Projection {
         for k in 0..m {
             let scale: f64 = (0..n).map(|i| jacobian[k * n + i] * self.inverse[k * n + i]).sum();
             let pivot = gram[k * m + k];
-            // Written so that NaN fails.
-            if !(pivot > DEPENDENT_ROW * scale) {
+            if pivot <= DEPENDENT_ROW * scale || pivot.is_nan() {
                 return Err(StepError::RedundantConstraint { row: k, pivot: pivot / scale });
             }
             for r in k + 1..m {

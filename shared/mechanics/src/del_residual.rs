@@ -15,7 +15,7 @@
 //! rows     r_i^α = w_α Δt Ṡᵀμ + SᵀΓ + Σ_β a^{αβ} S^βᵀμ^β + w_α Δt Q_i        (+ p_i at α = 0; row s is p_i of the next state)
 //! ```
 //!
-//! Cost: about 400 (s + 1) flops per body; no allocation after construction. Nodes are lanes ([`crate::lanes`]).
+//! Cost: about 400 (s + 1) flops per body; no allocation after construction. Nodes are SIMD lanes.
 //! Source: the paper, Algorithm 1 (line 20 of the print has a stray `end for`); rows of the floating base:
 //! [`crate::floating_base`].
 

@@ -55,8 +55,7 @@ impl DenseLu {
             }
             self.pivots[k] = pivot;
             let size = self.entries[pivot * n + k].abs();
-            // Written so that NaN fails.
-            if !(size > SINGULAR * largest) {
+            if size <= SINGULAR * largest || size.is_nan() {
                 return Err((k, size));
             }
             if pivot != k {

@@ -49,6 +49,8 @@
 //! `no_std` (with `alloc` for constructors).
 #![cfg_attr(not(feature = "std"), no_std)]
 #![forbid(unsafe_code)]
+// Nodes, coordinates and rows are indices of the formulas; iterators would hide which is which.
+#![allow(clippy::needless_range_loop)]
 
 extern crate alloc;
 

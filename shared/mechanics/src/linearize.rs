@@ -327,10 +327,10 @@ impl Linearizer {
         }
         self.tangent.evaluate(tree, del);
         self.tangent.next_momentum_into(tree, del, &mut self.momentum);
-        if let Some((dof, node)) = input {
-            if self.hold == InputHold::Held || node == s {
-                self.momentum[dof] += step(s);
-            }
+        if let Some((dof, node)) = input
+            && (self.hold == InputHold::Held || node == s)
+        {
+            self.momentum[dof] += step(s);
         }
         self.write_column(tree, del, column, n);
     }

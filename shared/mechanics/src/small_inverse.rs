@@ -25,8 +25,7 @@ pub(crate) fn invert<const N: usize>(block: [[f64; N]; N], s: usize) -> Result<[
         a.swap(k, pivot);
         inverse.swap(k, pivot);
         let size = a[k][k].abs();
-        // Written so that NaN fails.
-        if !(size > SINGULAR * largest) {
+        if size <= SINGULAR * largest || size.is_nan() {
             return Err(size);
         }
         let scale = 1.0 / a[k][k];

@@ -396,7 +396,7 @@ mod tests {
 
     #[test]
     fn log_inverts_exp_up_to_a_half_turn() {
-        for angle in [0.0, 1e-9, 1e-3, 0.5, 3.0, 3.1415, core::f64::consts::PI - 1e-9] {
+        for angle in [0.0, 1e-9, 1e-3, 0.5, 3.0, 3.12, core::f64::consts::PI - 1e-9] {
             let omega = Vector3::new(0.36, 0.48, -0.8) * angle;
             let back = log_rotation(&exp_rotation(&omega));
             assert!((back - omega).norm() < 1e-8 * (1.0 + angle), "angle {angle}: {back} instead of {omega}");

@@ -369,7 +369,6 @@ impl Integrator {
             }
             if iteration == 0 || self.options.variant == NewtonVariant::Exact || !fresh {
                 self.factor(tree, report)?;
-                fresh = true;
                 remembered = 0;
             }
             match (&mut self.dense, self.use_dense) {

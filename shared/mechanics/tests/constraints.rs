@@ -1,4 +1,5 @@
 //! C-RATTLE against the oracle vectors, its orders of convergence, symplecticity on the manifold, refusals.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod oracle;
 

@@ -1,4 +1,5 @@
 //! Newton-Euler against the mass matrix, and against derivatives of the energies.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod random_tree;
 

@@ -1,4 +1,5 @@
 //! Forward kinematics: against a direct product of transforms, finite differences, and the definition of the Jacobians.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod random_tree;
 

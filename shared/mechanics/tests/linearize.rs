@@ -1,4 +1,5 @@
 //! `A`, `B` and their adjoint products against the oracle vectors, by both paths and every factorisation; symplecticity.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod oracle;
 

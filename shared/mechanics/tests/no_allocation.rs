@@ -1,4 +1,5 @@
 //! No memory is taken in a warm call: a counting allocator around every call that a control cycle makes.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 #![allow(unsafe_code, reason = "a global allocator that counts; it passes every call on to the system's")]
 
 mod sample_robots;

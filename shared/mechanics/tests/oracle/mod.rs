@@ -1,4 +1,5 @@
 //! Reads the oracle vectors of `tests/vectors/` (format: the README there).
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 #![allow(dead_code)]
 
 use delmpc_mechanics::spatial::{RigidTransform, Wrench};
