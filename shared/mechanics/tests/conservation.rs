@@ -19,9 +19,12 @@ const REVERSAL: f64 = 1e-12;
 const TUMBLING: f64 = 1e-11;
 /// Exact invariants, relative to their size: round-off summed over some hundred steps.
 const EXACT: f64 = 1e-13;
-/// Momenta of joints that the motion keeps, over some hundred steps by the default solver: it stops at a change of the nodes predicted
-/// below 1e-14, and the Newton matrix (about 1e3 to 1e4 here) turns what is left into momentum. Exact Newton is held to `EXACT`.
-const BY_SOLVER: f64 = 1e-9;
+/// Momenta of joints that the motion keeps, over some hundred steps: the step solves for them. Exact Newton leaves round-off (1.2e-13
+/// measured), the default what its stopping rule leaves (5e-12 measured): a change of the nodes predicted below 1e-16, times the
+/// Newton matrix (about 1e4 here).
+const BY_EXACT_NEWTON: f64 = 1e-12;
+/// See [`BY_EXACT_NEWTON`].
+const BY_SOLVER: f64 = 2e-11;
 
 fn trees_without_dissipation() -> Vec<(&'static str, KinematicTree, State)> {
     let chain = spatial_chain(GRAVITY, Forces::Springs);
@@ -249,7 +252,7 @@ fn linear_momentum_of_a_chain_on_three_slides_is_exact_and_grows_with_the_weight
         worst[usize::from(exact)] = worst[usize::from(exact)].max(change);
     }
     assert!(
-        worst[1] <= EXACT && worst[0] <= BY_SOLVER,
+        worst[1] <= BY_EXACT_NEWTON && worst[0] <= BY_SOLVER,
         "exact Newton {:.2e}, default {:.2e}",
         worst[1],
         worst[0]
@@ -284,7 +287,7 @@ fn momentum_of_a_cyclic_coordinate_is_exact() {
         worst[usize::from(exact)] = worst[usize::from(exact)].max(change);
     }
     assert!(
-        worst[1] <= EXACT && worst[0] <= BY_SOLVER,
+        worst[1] <= BY_EXACT_NEWTON && worst[0] <= BY_SOLVER,
         "exact Newton {:.2e}, default {:.2e}",
         worst[1],
         worst[0]

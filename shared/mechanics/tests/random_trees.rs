@@ -44,8 +44,8 @@ const TORQUE_SCALE: f64 = 1e3;
 const SAME_LINEARISATION: f64 = 1e-8;
 /// Residual of a step solved to round-off, relative to the largest momentum term in it.
 const RESIDUAL_FLOOR: f64 = 1e-14;
-/// The same by the default stopping rule: a change of the nodes predicted below 1e-14, times the Newton matrix.
-const RESIDUAL_DEFAULT: f64 = 1e-9;
+/// The same by the default stopping rule: a change of the nodes predicted below 1e-16, times the Newton matrix.
+const RESIDUAL_DEFAULT: f64 = 1e-11;
 
 #[derive(Clone, Copy)]
 struct Traits(u8);

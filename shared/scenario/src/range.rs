@@ -118,6 +118,7 @@ fn check_controller(controller: &ControllerSettings) -> Result<(), Violation> {
     let [com_x, com_y, com_z] = weights.com_per_m2;
     let [speed_x, speed_y, speed_z] = weights.com_velocity_s2_per_m2;
     let [spin_x, spin_y, spin_z] = weights.spin_per_n2m2s2;
+    let [foot_x, foot_y, foot_z] = weights.swing_foot_per_m2;
     for (name, value) in [
         ("posture_per_rad2", weights.posture_per_rad2),
         ("joint_speed_s2_per_rad2", weights.joint_speed_s2_per_rad2),
@@ -132,7 +133,9 @@ fn check_controller(controller: &ControllerSettings) -> Result<(), Violation> {
         ("spin_per_n2m2s2", spin_z),
         ("hand_per_m2", weights.hand_per_m2),
         ("hand_velocity_s2_per_m2", weights.hand_velocity_s2_per_m2),
-        ("swing_foot_per_m2", weights.swing_foot_per_m2),
+        ("swing_foot_per_m2", foot_x),
+        ("swing_foot_per_m2", foot_y),
+        ("swing_foot_per_m2", foot_z),
         ("swing_foot_rotation_per_rad2", weights.swing_foot_rotation_per_rad2),
     ] {
         within(&format!("controller.weights.{name}"), value, 0.0, LARGEST_WEIGHT)?;

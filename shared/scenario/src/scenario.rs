@@ -166,8 +166,8 @@ pub struct WeightSettings {
     pub hand_per_m2: f64,
     /// Its velocity, 1/(m/s)².
     pub hand_velocity_s2_per_m2: f64,
-    /// Swing foot away from where it hangs, 1/m².
-    pub swing_foot_per_m2: f64,
+    /// Swing foot away from where it hangs, along x, y, z, 1/m².
+    pub swing_foot_per_m2: [f64; 3],
     /// Its rotation, 1/rad².
     pub swing_foot_rotation_per_rad2: f64,
 }
@@ -347,8 +347,8 @@ impl Default for WeightSettings {
             spin_per_n2m2s2: [0.0; 3],
             hand_per_m2: 10_000.0,
             hand_velocity_s2_per_m2: 10.0,
-            swing_foot_per_m2: 0.0,
-            swing_foot_rotation_per_rad2: 0.0,
+            swing_foot_per_m2: [0.0, 0.0, 1000.0],
+            swing_foot_rotation_per_rad2: 5.0,
         }
     }
 }
