@@ -41,8 +41,7 @@ pub fn controller(arguments: &PartArguments, allocations: fn() -> u64) -> Result
     if scenario.clock == Clock::Realtime {
         controller_loop = controller_loop.counting(allocations);
     }
-    let (ending, figures) =
-        controller_loop.run(&mut controller, &mut membership).map_err(Failure::fault)?;
+    let (ending, figures) = controller_loop.run(&mut controller, &mut membership).map_err(Failure::fault)?;
     drop(membership);
     supervisor.stand_in(run);
     leave_part(arguments.out.as_deref(), CONTROLLER_PART, &part(scenario, &figures))?;

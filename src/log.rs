@@ -110,7 +110,8 @@ impl Log {
     pub fn finish(mut self) -> Result<u64, Failure> {
         self.queue = None; // the writer ends when it has written what is left
         if let Some(writer) = self.writer.take() {
-            let written = writer.join().map_err(|_| Failure::Fault("the log's writer broke down".to_owned()))?;
+            let written =
+                writer.join().map_err(|_| Failure::Fault("the log's writer broke down".to_owned()))?;
             written.map_err(|error| Failure::Fault(format!("the log cannot be written: {error}")))?;
         }
         Ok(self.dropped)
@@ -155,7 +156,8 @@ fn write_all(
         bytes.extend_from_slice(&ENCAPSULATION);
         bytes.extend_from_slice(content);
         let sequence = sequences.entry(channel_id).or_default();
-        let header = MessageHeader { channel_id, sequence: *sequence, log_time: time_ns, publish_time: time_ns };
+        let header =
+            MessageHeader { channel_id, sequence: *sequence, log_time: time_ns, publish_time: time_ns };
         *sequence += 1;
         writer.write_to_known_channel(&header, &bytes)?;
     }
@@ -318,34 +320,94 @@ mod tests {
             PlantState,
             PLANT_STATE_FIELDS,
             [
-                header, time_ns, applied_command_sequence, clock, n_joints, stance_foot, contact_flags, status_flags,
-                watchdog_level, position, velocity, applied_torque, base_position_w, base_orientation_w,
-                base_angular_velocity_b, base_linear_velocity_b, stance_torque_b, stance_force_b,
+                header,
+                time_ns,
+                applied_command_sequence,
+                clock,
+                n_joints,
+                stance_foot,
+                contact_flags,
+                status_flags,
+                watchdog_level,
+                position,
+                velocity,
+                applied_torque,
+                base_position_w,
+                base_orientation_w,
+                base_angular_velocity_b,
+                base_linear_velocity_b,
+                stance_torque_b,
+                stance_force_b,
             ]
         );
         assert_layout!(
             Command,
             COMMAND_FIELDS,
             [
-                header, state_sequence, state_time_ns, valid_from_ns, valid_until_ns, n_joints, verdict, fallback_level,
-                reason, torque, position_ref, velocity_ref, gain, report,
+                header,
+                state_sequence,
+                state_time_ns,
+                valid_from_ns,
+                valid_until_ns,
+                n_joints,
+                verdict,
+                fallback_level,
+                reason,
+                torque,
+                position_ref,
+                velocity_ref,
+                gain,
+                report,
             ]
         );
         assert_layout!(
             CycleReport,
             CYCLE_REPORT_FIELDS,
             [
-                state_in_ns, shift_ns, linearize_ns, riccati_ns, qp_ns, publish_ns, total_ns, worst_violation,
-                worst_constraint, worst_stage, worst_row, qp_solves, qp_iterations, active_rows, dropped_rows, allocations,
+                state_in_ns,
+                shift_ns,
+                linearize_ns,
+                riccati_ns,
+                qp_ns,
+                publish_ns,
+                total_ns,
+                worst_violation,
+                worst_constraint,
+                worst_stage,
+                worst_row,
+                qp_solves,
+                qp_iterations,
+                active_rows,
+                dropped_rows,
+                allocations,
             ]
         );
         assert_layout!(
             Truth,
             TRUTH_FIELDS,
             [
-                time_ns, n_joints, contact_flags, status_flags, watchdog_level, position, velocity, torque,
-                base_position_w, base_orientation_w, com_w, com_velocity_w, sole_position_w, stance_slip_m, sole_tilt_rad,
-                stance_torque_b, stance_force_b, cop_margin_m, friction_use, torque_ratio, hand_w, push_force_w,
+                time_ns,
+                n_joints,
+                contact_flags,
+                status_flags,
+                watchdog_level,
+                position,
+                velocity,
+                torque,
+                base_position_w,
+                base_orientation_w,
+                com_w,
+                com_velocity_w,
+                sole_position_w,
+                stance_slip_m,
+                sole_tilt_rad,
+                stance_torque_b,
+                stance_force_b,
+                cop_margin_m,
+                friction_use,
+                torque_ratio,
+                hand_w,
+                push_force_w,
                 energy_balance_error,
             ]
         );

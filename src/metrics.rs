@@ -118,9 +118,11 @@ impl Metrics {
         }
         lower(&mut figures.min_com_height_m, truth.com_w[2]);
         // The path, and as a check on it the distance.
-        let slip = horizontal_distance(&truth.sole_position_w, &start.sole_position_w).max(truth.stance_slip_m);
+        let slip =
+            horizontal_distance(&truth.sole_position_w, &start.sole_position_w).max(truth.stance_slip_m);
         figures.max_stance_slip_m = figures.max_stance_slip_m.max(slip);
-        figures.other_foot_touched |= truth.contact_flags & !start.contact_flags != 0 && start.contact_flags != 0;
+        figures.other_foot_touched |=
+            truth.contact_flags & !start.contact_flags != 0 && start.contact_flags != 0;
         figures.max_stance_tilt_rad = figures.max_stance_tilt_rad.max(truth.sole_tilt_rad);
         lower(&mut figures.min_cop_margin_m, truth.cop_margin_m);
         raise(&mut figures.max_friction_use, truth.friction_use);
@@ -129,7 +131,10 @@ impl Metrics {
 
         if let Some(ball) = self.ball {
             let error = distance(&truth.hand_w, &ball.position_m);
-            if truth.time_ns >= ball.deadline_ns && figures.hand_error_at_deadline_m.is_none() && error.is_finite() {
+            if truth.time_ns >= ball.deadline_ns
+                && figures.hand_error_at_deadline_m.is_none()
+                && error.is_finite()
+            {
                 figures.hand_error_at_deadline_m = Some(error);
             }
             if (ball.deadline_ns..=ball.hold_end_ns).contains(&truth.time_ns) {
@@ -201,7 +206,12 @@ mod tests {
                 hold_s: 0.5,
                 ..ReachSettings::default()
             }),
-            push: vec![PushSettings { impulse_ns: 1.0, start_s: 1.5, duration_s: 0.1, ..PushSettings::default() }],
+            push: vec![PushSettings {
+                impulse_ns: 1.0,
+                start_s: 1.5,
+                duration_s: 0.1,
+                ..PushSettings::default()
+            }],
             ..Scenario::default()
         }
     }

@@ -9,11 +9,11 @@ use delmpc_mechanics::inverse_dynamics::{InverseDynamicsWorkspace, gravity_force
 use delmpc_mechanics::kinematics::{Configuration, Kinematics, base_link_pose, base_pose_from_link};
 use delmpc_mechanics::mass_matrix::{MassMatrixWorkspace, mass_matrix_into};
 use delmpc_mechanics::prelude::{
-    InputHold, Integrator, JointKind, KinematicTree, Linearizer, LobattoRule, RigidTransform, State, StateCoordinates,
-    StepForces, StepOptions, Twist,
+    InputHold, Integrator, JointKind, KinematicTree, Linearizer, LobattoRule, RigidTransform, State,
+    StateCoordinates, StepForces, StepOptions, Twist,
 };
 use delmpc_mechanics::velocity::VelocityWorkspace;
-use delmpc_robots::{BaseChoice, LoadOptions, RobotModel, load_with};
+use delmpc_robots::{BaseChoice, ImpossibleInertia, LoadOptions, RobotModel, load_with};
 use nalgebra::{DMatrix, DVector, Quaternion, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
@@ -30,6 +30,9 @@ pub struct ModelArguments {
     /// State and step as JSON; the answer is one JSON object
     #[arg(long, value_name = "FILE.json")]
     pub at: Option<PathBuf>,
+    /// Take inertias that break the triangle inequality as they are, with a warning
+    #[arg(long)]
+    pub accept_impossible_inertia: bool,
 }
 
 /// Runs the command.
@@ -41,11 +44,12 @@ pub fn model(arguments: &ModelArguments) -> Result<Ended, Failure> {
         Some(file) => {
             let question = read_question(file)?;
             let base = arguments.base.clone().or_else(|| question.base.clone());
-            let robot = load_robot(&arguments.urdf, base.as_deref(), question.gravity)?;
-            let answer = answer(&robot, &question).map_err(|error| Failure::Input(format!("{}: {error}", file.display())))?;
+            let robot = load_robot(arguments, base.as_deref(), question.gravity)?;
+            let answer = answer(&robot, &question)
+                .map_err(|error| Failure::Input(format!("{}: {error}", file.display())))?;
             println!("{}", serde_json::to_string(&answer).map_err(Failure::fault)?);
         }
-        None => print!("{}", table(&load_robot(&arguments.urdf, arguments.base.as_deref(), None)?)),
+        None => print!("{}", table(&load_robot(arguments, arguments.base.as_deref(), None)?)),
     }
     Ok(Ended::Well)
 }
@@ -145,8 +149,16 @@ fn read_question(file: &Path) -> Result<Question, Failure> {
 }
 
 /// Loads a robot with the base of the command line.
-fn load_robot(urdf: &Path, base: Option<&str>, gravity: Option<[f64; 3]>) -> Result<RobotModel, Failure> {
+fn load_robot(
+    arguments: &ModelArguments,
+    base: Option<&str>,
+    gravity: Option<[f64; 3]>,
+) -> Result<RobotModel, Failure> {
+    let urdf = arguments.urdf.as_path();
     let mut options = LoadOptions::default();
+    if arguments.accept_impossible_inertia {
+        options.impossible_inertia = ImpossibleInertia::Accept;
+    }
     if let Some(gravity) = gravity {
         options.gravity_w = Vector3::from(gravity);
     }
@@ -242,13 +254,19 @@ fn step(
         Order::Lobatto4 => 4,
     };
     let rule = LobattoRule::new(nodes).map_err(|error| error.to_string())?;
+    // Whoever asks about one step may ask about a wild one.
+    let options = StepOptions { turn_limit: f64::INFINITY, ..StepOptions::default() };
     let mut integrator =
-        Integrator::new(tree, &rule, dt, StepOptions::default()).map_err(|error| error.to_string())?;
+        Integrator::new(tree, &rule, dt, options).map_err(|error| error.to_string())?;
     let inputs: Vec<f64>;
     let forces = match (&question.u, &question.u_nodes) {
         (Some(_), Some(_)) => return Err("both `u` and `u_nodes`: give one".to_owned()),
         (_, Some(per_node)) if per_node.len() != nodes + 1 => {
-            return Err(format!("`u_nodes` has {} entries: this order has {} nodes", per_node.len(), nodes + 1));
+            return Err(format!(
+                "`u_nodes` has {} entries: this order has {} nodes",
+                per_node.len(),
+                nodes + 1
+            ));
         }
         (_, Some(per_node)) => {
             let each = per_node.iter().map(|u| by_joint(robot, u, "u_nodes"));
@@ -318,10 +336,7 @@ impl BaseFrame {
 
     fn answer(&self) -> BasePoseAnswer {
         let quaternion = UnitQuaternion::from_matrix(&self.link_pose_w.rotation);
-        BasePoseAnswer {
-            xyz: self.link_pose_w.translation.into(),
-            quaternion_xyzw: quaternion.coords.into(),
-        }
+        BasePoseAnswer { xyz: self.link_pose_w.translation.into(), quaternion_xyzw: quaternion.coords.into() }
     }
 
     /// From velocities in our coordinates to those of the mechanics: the twist of the link to the spatial one.
@@ -341,7 +356,10 @@ impl BaseFrame {
         if tree.is_floating() {
             let link_in_body = delmpc_mechanics::spatial::RigidTransform {
                 rotation: self.pose_w.rotation.tr_mul(&self.link_pose_w.rotation),
-                translation: self.pose_w.rotation.tr_mul(&(self.link_pose_w.translation - self.pose_w.translation)),
+                translation: self
+                    .pose_w
+                    .rotation
+                    .tr_mul(&(self.link_pose_w.translation - self.pose_w.translation)),
             };
             let (forward, backward) = (link_in_body.inverse().adjoint(), link_in_body.adjoint());
             to_link.view_mut((0, 0), (6, 6)).copy_from(&forward);
@@ -358,7 +376,10 @@ fn by_joint(robot: &RobotModel, values: &BTreeMap<String, f64>, what: &str) -> R
     let mut vector = vec![0.0; robot.joint_names.len()];
     for (name, value) in values {
         let joint = robot.joint(name).ok_or_else(|| {
-            format!("`{what}.{name}`: the robot has no such joint; its joints are {}", robot.joint_names.join(", "))
+            format!(
+                "`{what}.{name}`: the robot has no such joint; its joints are {}",
+                robot.joint_names.join(", ")
+            )
         })?;
         vector[joint] = *value;
     }
@@ -378,9 +399,14 @@ fn table(robot: &RobotModel) -> String {
     let _ = writeln!(text, "{}: {base}, {joints} joints, {bodies} bodies, {mass:.4} kg", robot.name);
     let mut kinematics = Kinematics::new(tree);
     let zeros = vec![0.0; joints];
-    if kinematics.update_positions(tree, &Configuration::floating(RigidTransform::identity(), &zeros)).is_ok() {
+    if kinematics.update_positions(tree, &Configuration::floating(RigidTransform::identity(), &zeros)).is_ok()
+    {
         let com = kinematics.mass_centre_of_tree_w(tree);
-        let _ = writeln!(text, "mass centre at zero, base body at the origin: {:.4} {:.4} {:.4} m", com.x, com.y, com.z);
+        let _ = writeln!(
+            text,
+            "mass centre at zero, base body at the origin: {:.4} {:.4} {:.4} m",
+            com.x, com.y, com.z
+        );
     }
     let widest = robot.body_names.iter().chain(&robot.joint_names).map(String::len).max().unwrap_or(0).max(6);
     let _ = writeln!(
@@ -412,7 +438,8 @@ fn table(robot: &RobotModel) -> String {
     let soles: Vec<&str> = robot.soles.iter().map(|sole| sole.name.as_str()).collect();
     let postures: Vec<&str> = robot.postures.iter().map(|posture| posture.name.as_str()).collect();
     let frames: Vec<&str> = robot.frames.iter().map(|frame| frame.name.as_str()).collect();
-    let _ = writeln!(text, "\nsoles: {}\nframes: {}\npostures: {}", names(soles), names(frames), names(postures));
+    let _ =
+        writeln!(text, "\nsoles: {}\nframes: {}\npostures: {}", names(soles), names(frames), names(postures));
     let _ = writeln!(text, "contact points: {}", robot.contacts.len());
     for warning in &robot.warnings {
         let _ = writeln!(text, "warning: {warning}");

@@ -1,70 +1,95 @@
-//! Both loops in one process, over the in-process link: deterministic, and open to a debugger.
+//! Both loops in one thread, over the in-process link: deterministic, fast, and open to a debugger.
+//!
+//! The plant's loop runs; where it looks for the answer to a state, the controller gives it.
 
 use delmpc_controller_process::controller_loop::ControllerLoop;
+use delmpc_controller_process::figures::CycleFigures;
 use delmpc_controller_process::membership::Alone;
 use delmpc_controller_process::stop::StopFlag;
 use delmpc_messages::{Command, PlantState};
-use delmpc_transport::{RunId, in_process_link};
+use delmpc_transport::{LinkError, Publisher, RunId, Subscriber, in_process_link};
 
 use crate::controller::part;
 use crate::log::Log;
 use crate::part::{leave_part, message_run_id};
-use crate::robot_controller::RobotController;
-use crate::simulated_robot::SimulatedRobot;
 use crate::plant::about;
 use crate::plant_process::PlantLoop;
+use crate::robot_controller::RobotController;
 use crate::run_folder::{CONTROLLER_PART, PLANT_PART, RunFolder};
 use crate::setup::Setup;
+use crate::simulated_robot::SimulatedRobot;
+use crate::summary::PlantPart;
 use crate::supervisor::Course;
 use crate::verdict::Failure;
 
-/// Runs a lockstep scenario to its end.
+/// Runs a lockstep scenario to its end and leaves its results in a folder.
 ///
 /// # Errors
 /// [`Failure::Input`] when a part cannot be made of the scenario, [`Failure::Fault`] when the log cannot be written.
 pub fn run_in_one_process(setup: &Setup, folder: &RunFolder, stop: &StopFlag) -> Result<Course, Failure> {
+    let log = Log::create(&folder.file("log.mcap"), about(setup, RunId(0)), true)?;
+    match simulate(setup, log, stop)? {
+        Simulated::Fault(why) => Ok(Course::Fault(why)),
+        Simulated::Ended { plant, figures } => {
+            leave_part(Some(folder.path()), PLANT_PART, &*plant)?;
+            leave_part(Some(folder.path()), CONTROLLER_PART, &part(&setup.scenario, &figures))?;
+            Ok(if stop.is_set() { Course::Interrupted } else { Course::Finished })
+        }
+    }
+}
+
+/// How a simulated run ended.
+#[derive(Debug)]
+pub enum Simulated {
+    /// It came to its end, or was stopped.
+    Ended {
+        /// What the plant has to say.
+        plant: Box<PlantPart>,
+        /// What the controller has to say.
+        figures: CycleFigures,
+    },
+    /// A step could not be computed, or a link broke.
+    Fault(String),
+}
+
+/// Runs a lockstep scenario to its end in this thread.
+///
+/// # Errors
+/// As [`run_in_one_process`].
+pub fn simulate(setup: &Setup, log: Log, stop: &StopFlag) -> Result<Simulated, Failure> {
     let scenario = &setup.scenario;
     let mut robot = SimulatedRobot::new(setup)?;
-    let mut controller = RobotController::new(setup)?;
-    let log = Log::create(&folder.file("log.mcap"), about(setup, RunId(0)), true)?;
     let (run, hash) = (message_run_id(RunId(0), scenario), setup.joint_set_hash());
     let joints = setup.robot.joint_names.len() as u32;
     let (states, states_in) = in_process_link::<PlantState>();
     let (commands, commands_in) = in_process_link::<Command>();
-    let plant_loop = PlantLoop::new(scenario, states, commands_in, &PlantState::new(run, hash, joints), log);
-    let controller_loop = ControllerLoop::new(scenario, states_in, commands, &Command::new(run, hash, joints));
-
-    let (plant, controller) = std::thread::scope(|scope| {
-        let attendance = Alone(stop.clone());
-        let controller = scope.spawn(move || {
-            let _last_words = LastWords(attendance.0.clone());
-            controller_loop.run(&mut controller, &mut attendance.clone())
-        });
-        let plant = plant_loop.run(&mut robot, &mut Alone(stop.clone()));
-        if plant.is_err() {
-            stop.set(); // the controller waits for a state that will not come
+    let controller_loop =
+        ControllerLoop::new(scenario, states_in, commands, &Command::new(run, hash, joints));
+    let mut answers = Answers { controller_loop, controller: RobotController::new(setup)?, commands: commands_in };
+    let blank = PlantState::new(run, hash, joints);
+    let plant_loop = PlantLoop::new(scenario, states, &mut answers, &blank, log);
+    match plant_loop.run(&mut robot, &mut Alone(stop.clone())) {
+        Err(fault) => Ok(Simulated::Fault(fault.to_string())),
+        Ok((_, mut plant, log)) => {
+            plant.log_records_dropped = log.finish()?;
+            let figures = answers.controller_loop.figures().clone();
+            Ok(Simulated::Ended { plant: Box::new(plant), figures })
         }
-        (plant, controller.join())
-    });
-    let (_, mut plant_part, log) = match plant {
-        Ok(outcome) => outcome,
-        Err(fault) => return Ok(Course::Fault(fault.to_string())),
-    };
-    plant_part.log_records_dropped = log.finish()?;
-    let controller = controller.map_err(|_| Failure::Fault("the controller broke down".to_owned()))?;
-    let (_, figures) = controller.map_err(Failure::fault)?;
-    leave_part(Some(folder.path()), PLANT_PART, &plant_part)?;
-    leave_part(Some(folder.path()), CONTROLLER_PART, &part(scenario, &figures))?;
-    Ok(if stop.is_set() { Course::Interrupted } else { Course::Finished })
+    }
 }
 
-/// A controller that breaks down must not leave the plant waiting.
-struct LastWords(StopFlag);
+/// The plant's end of a link whose other end is a controller that answers when asked.
+struct Answers<'a, S, P, C> {
+    controller_loop: ControllerLoop<'a, S, P>,
+    controller: RobotController,
+    commands: C,
+}
 
-impl Drop for LastWords {
-    fn drop(&mut self) {
-        if std::thread::panicking() {
-            self.0.set();
-        }
+impl<S: Subscriber<PlantState>, P: Publisher<Command>, C: Subscriber<Command>> Subscriber<Command>
+    for Answers<'_, S, P, C>
+{
+    fn receive_latest(&mut self) -> Result<Option<&Command>, LinkError> {
+        self.controller_loop.answer(&mut self.controller)?;
+        self.commands.receive_latest()
     }
 }

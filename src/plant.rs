@@ -27,14 +27,17 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
     let run = run_id(arguments, &setup)?;
     let mut robot = SimulatedRobot::new(&setup)?;
     let log = match &arguments.out {
-        Some(folder) => Log::create(&folder.join("log.mcap"), about(&setup, run), scenario.clock == Clock::Lockstep)?,
+        Some(folder) => {
+            Log::create(&folder.join("log.mcap"), about(&setup, run), scenario.clock == Clock::Lockstep)?
+        }
         None => Log::none(),
     };
     prepare_machine(Role::Plant, scenario);
 
     let hash = setup.joint_set_hash();
-    let mut membership = Membership::join(run, hash, Role::Plant, arguments.supervised, scenario.process.hang_s)
-        .map_err(Failure::fault)?;
+    let mut membership =
+        Membership::join(run, hash, Role::Plant, arguments.supervised, scenario.process.hang_s)
+            .map_err(Failure::fault)?;
     if !arguments.supervised {
         say(&format!("run {run}: the plant waits for a controller of the same scenario"));
     }

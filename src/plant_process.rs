@@ -281,7 +281,10 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
         };
         self.queue.push(command);
         let realtime = self.scenario.clock == Clock::Realtime;
-        if realtime && self.timing.ages_ns.len() < self.timing.ages_ns.capacity() && command.state_sequence > 1 {
+        if realtime
+            && self.timing.ages_ns.len() < self.timing.ages_ns.capacity()
+            && command.state_sequence > 1
+        {
             let measured_ns = self.start_ns + command.state_time_ns;
             self.timing.ages_ns.push(monotonic_ns().saturating_sub(measured_ns));
         }
@@ -321,7 +324,11 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
     }
 
     /// Says that no further state will come, and waits a little for the controller to hear it.
-    fn say_farewell(&mut self, plant: &mut impl Plant, membership: &mut impl Attendance) -> Result<(), PlantFault> {
+    fn say_farewell(
+        &mut self,
+        plant: &mut impl Plant,
+        membership: &mut impl Attendance,
+    ) -> Result<(), PlantFault> {
         self.send_state(plant, status::FINISHED)?;
         let begin_ns = monotonic_ns();
         while !membership.peer_is_done() && monotonic_ns() < begin_ns + FAREWELL_NS {

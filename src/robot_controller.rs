@@ -3,7 +3,9 @@
 use delmpc_controller_core::config::{ConstraintConfig, ControllerConfig};
 use delmpc_controller_core::cycle::Clock as CycleClock;
 use delmpc_controller_core::prelude as core;
-use delmpc_controller_core::prelude::{BodyPoint, ControllerModel, JointLimits, Reach, StanceObservation, TaskWeights};
+use delmpc_controller_core::prelude::{
+    BodyPoint, ControllerModel, JointLimits, Reach, StanceObservation, TaskWeights,
+};
 use delmpc_controller_process::clock::monotonic_ns;
 use delmpc_controller_process::controller_loop::Controller;
 use delmpc_messages::{Command, PlantState};
@@ -35,7 +37,8 @@ impl RobotController {
     /// # Errors
     /// [`Failure::Input`] when the robot cannot be controlled like that.
     pub fn new(setup: &Setup) -> Result<Self, Failure> {
-        let refused = |error: &dyn std::fmt::Display| Failure::Input(format!("{}: {error}", setup.scenario.name));
+        let refused =
+            |error: &dyn std::fmt::Display| Failure::Input(format!("{}: {error}", setup.scenario.name));
         let model = model(setup).map_err(|error| refused(&error))?;
         let mut controller =
             core::Controller::new(model, config(&setup.scenario)).map_err(|error| refused(&error))?;

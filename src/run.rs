@@ -28,7 +28,9 @@ pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
     let setup = Setup::read(&file, &options.set)?;
     let scenario = &setup.scenario;
     if options.one_process && scenario.clock != Clock::Lockstep {
-        return Err(Failure::Input("--one-process needs the lockstep clock: add --set clock=lockstep".to_owned()));
+        return Err(Failure::Input(
+            "--one-process needs the lockstep clock: add --set clock=lockstep".to_owned(),
+        ));
     }
     let talkative = !options.quiet && !options.json;
     if !options.quiet {

@@ -52,18 +52,23 @@ impl RunFolder {
                 }
                 Ok(Self { path: path.to_owned() })
             }
-            None => Self::create_new(Path::new("runs"), &format!("{scenario}-{}", time_stamp(SystemTime::now()))),
+            None => {
+                Self::create_new(Path::new("runs"), &format!("{scenario}-{}", time_stamp(SystemTime::now())))
+            }
         }
     }
 
     fn create_new(runs: &Path, name: &str) -> Result<Self, Failure> {
-        let cannot = |error| Failure::Input(format!("{}: {error}; name another folder with --out", runs.display()));
+        let cannot =
+            |error| Failure::Input(format!("{}: {error}; name another folder with --out", runs.display()));
         fs::create_dir_all(runs).map_err(cannot)?;
         let mut folder = name.to_owned();
         for attempt in 2.. {
             match fs::create_dir(runs.join(&folder)) {
                 Ok(()) => break,
-                Err(error) if error.kind() == ErrorKind::AlreadyExists => folder = format!("{name}-{attempt}"),
+                Err(error) if error.kind() == ErrorKind::AlreadyExists => {
+                    folder = format!("{name}-{attempt}")
+                }
                 Err(error) => return Err(cannot(error)),
             }
         }

@@ -55,7 +55,9 @@ impl Setup {
     fn check_names(&self) -> Result<(), String> {
         let Self { scenario, robot, .. } = self;
         if !robot.tree.is_floating() {
-            return Err("`robot.urdf`: this robot is fixed to the world; a plant needs one that can fall".to_owned());
+            return Err(
+                "`robot.urdf`: this robot is fixed to the world; a plant needs one that can fall".to_owned()
+            );
         }
         let joints = robot.joint_names.len();
         if joints > MAX_JOINTS {

@@ -7,8 +7,8 @@ use delmpc_mechanics::prelude::State;
 use delmpc_messages::{ClockKind, Command, PlantState};
 use delmpc_plant::prelude as simulation;
 use delmpc_plant::prelude::{
-    ActuatorConfig, ActuatorLimits, ContactPoint, Foot, ModelErrors, MonitorConfig, PlantConfig, PlantModel, SensorConfig,
-    WatchdogConfig,
+    ActuatorConfig, ActuatorLimits, ContactPoint, Foot, ModelErrors, MonitorConfig, PlantConfig, PlantModel,
+    SensorConfig, WatchdogConfig,
 };
 use delmpc_robots::RobotModel;
 use delmpc_scenario::{Clock, PushSettings, SensorSettings};
@@ -148,7 +148,10 @@ impl Holding {
         let inertia: Vec<f64> = (0..joints).map(|joint| mass_matrix[joint * joints + joint]).collect();
         let floating = |rooted_values: &[f64]| {
             let mut values = vec![0.0; joints];
-            rooted.rerooted.joints_to_floating(rooted_values, &mut values).map_err(|error| error.to_string())?;
+            rooted
+                .rerooted
+                .joints_to_floating(rooted_values, &mut values)
+                .map_err(|error| error.to_string())?;
             Ok::<_, String>(values)
         };
         let (frequency, ratio) = (WATCHDOG_FREQUENCY, WATCHDOG_DAMPING_RATIO);
@@ -255,5 +258,7 @@ fn made_push(robot: &RobotModel, push: &PushSettings) -> Result<simulation::Push
 }
 
 fn on_no_body(name: &str) -> Failure {
-    Failure::Input(format!("`{name}` of the robot is fixed to the world: a plant needs it on a body that moves"))
+    Failure::Input(format!(
+        "`{name}` of the robot is fixed to the world: a plant needs it on a body that moves"
+    ))
 }

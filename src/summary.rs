@@ -191,12 +191,19 @@ fn missed_criterion(scenario: &Scenario, plant: &PlantPart) -> Option<String> {
         Some(format!("{key} = {value:.4}, needed is at least {least}"))
     };
     at_most("hand_error_at_deadline_m", robot.hand_error_at_deadline_m, limit.hand_error_at_deadline_m)
-        .or_else(|| at_most("hand_error_hold_max_m", robot.hand_error_hold_max_m, limit.hand_error_hold_max_m))
+        .or_else(|| {
+            at_most("hand_error_hold_max_m", robot.hand_error_hold_max_m, limit.hand_error_hold_max_m)
+        })
         .or_else(|| at_most("max_stance_slip_m", Some(robot.max_stance_slip_m), limit.max_stance_slip_m))
-        .or_else(|| at_most("max_stance_tilt_rad", Some(robot.max_stance_tilt_rad), limit.max_stance_tilt_rad))
+        .or_else(|| {
+            at_most("max_stance_tilt_rad", Some(robot.max_stance_tilt_rad), limit.max_stance_tilt_rad)
+        })
         .or_else(|| at_least("min_cop_margin_m", robot.min_cop_margin_m, limit.min_cop_margin_m))
         .or_else(|| at_most("max_torque_ratio", Some(robot.max_torque_ratio), limit.max_torque_ratio))
-        .or_else(|| (robot.recovered == Some(false)).then(|| "the robot did not come to rest after the push".to_owned()))
+        .or_else(|| {
+            (robot.recovered == Some(false))
+                .then(|| "the robot did not come to rest after the push".to_owned())
+        })
         .or_else(|| at_most("settle_time_s", robot.settle_time_s, limit.settle_time_s))
         .or_else(|| {
             let factor = plant.plant_real_time_factor.filter(|_| realtime);
@@ -234,7 +241,11 @@ pub fn table(summary: &Summary, scenario: &Scenario) -> String {
         let allowed = |most: f64| Some(format!("at most {}", millimetres(most)));
         if scenario.reach.is_some() {
             let (deadline, hold) = (robot.hand_error_at_deadline_m, robot.hand_error_hold_max_m);
-            line("hand to ball at the deadline", deadline.map(millimetres), allowed(limit.hand_error_at_deadline_m));
+            line(
+                "hand to ball at the deadline",
+                deadline.map(millimetres),
+                allowed(limit.hand_error_at_deadline_m),
+            );
             line("hand to ball while holding", hold.map(millimetres), allowed(limit.hand_error_hold_max_m));
         }
         line("stance slip", Some(millimetres(robot.max_stance_slip_m)), allowed(limit.max_stance_slip_m));
@@ -245,7 +256,11 @@ pub fn table(summary: &Summary, scenario: &Scenario) -> String {
         line("pressure point to edge of sole", robot.min_cop_margin_m.map(millimetres), Some(margin));
         line("friction used", robot.max_friction_use.map(|part| format!("{:.0} %", 100.0 * part)), None);
         let ratio = format!("at most {:.0} %", 100.0 * limit.max_torque_ratio);
-        line("largest torque of its limit", Some(format!("{:.0} %", 100.0 * robot.max_torque_ratio)), Some(ratio));
+        line(
+            "largest torque of its limit",
+            Some(format!("{:.0} %", 100.0 * robot.max_torque_ratio)),
+            Some(ratio),
+        );
         if robot.recovered.is_some() {
             let settle = robot.settle_time_s.map(|time| format!("{time:.2} s"));
             line("push to rest", settle, Some(format!("at most {} s", limit.settle_time_s)));
@@ -258,12 +273,20 @@ pub fn table(summary: &Summary, scenario: &Scenario) -> String {
         line("cycle time, 99.9 %", part.cycle_time_p999_s.map(milliseconds), None);
         line("deadlines missed", Some(part.deadline_misses.to_string()), None);
         line("QP solves", Some(part.qp_solves.to_string()), None);
-        line("worst fallback level", Some(part.fallback_level_max.to_string()), Some("0: fresh solution".to_owned()));
+        line(
+            "worst fallback level",
+            Some(part.fallback_level_max.to_string()),
+            Some("0: fresh solution".to_owned()),
+        );
     }
     if let Some(part) = &summary.plant {
         line("state to command, median", part.state_to_command_age_p50_s.map(milliseconds), None);
         line("plant step, median", part.plant_step_p50_s.map(milliseconds), None);
-        line("simulated over wall time", part.plant_real_time_factor.map(|factor| format!("{factor:.3}")), None);
+        line(
+            "simulated over wall time",
+            part.plant_real_time_factor.map(|factor| format!("{factor:.3}")),
+            None,
+        );
     }
     text
 }

@@ -187,7 +187,8 @@ impl Supervision {
             // Loading, connecting and warming up happen in one go.
             let starting = matches!(state, None | Some(ProcessState::Starting));
             if starting && waited_s > START_PATIENCE_S {
-                let message = format!("the {name} process (pid {pid}) did not start within {START_PATIENCE_S} s");
+                let message =
+                    format!("the {name} process (pid {pid}) did not start within {START_PATIENCE_S} s");
                 return Ok(Some(Course::Fault(message)));
             }
             if !starting && silent_s > self.hang_s {

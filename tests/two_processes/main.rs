@@ -72,7 +72,12 @@ fn a_killed_controller_is_a_fault() {
     let family = children(run.pid());
     let controller = member(&family, "controller").pid;
     support::signal(controller, Signal::KILL);
-    assert_fault(run, &family, &folder, &format!("the controller process (pid {controller}) was killed (signal 9)"));
+    assert_fault(
+        run,
+        &family,
+        &folder,
+        &format!("the controller process (pid {controller}) was killed (signal 9)"),
+    );
 }
 
 #[test]

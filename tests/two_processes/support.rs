@@ -135,8 +135,10 @@ pub fn children(supervisor: u32) -> Vec<Member> {
         let list = fs::read_to_string(task.path().join("children")).unwrap_or_default();
         for pid in list.split_whitespace().filter_map(|pid| pid.parse().ok()) {
             let line = fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
-            let words: Vec<String> =
-                line.split(|byte| *byte == 0).map(|word| String::from_utf8_lossy(word).into_owned()).collect();
+            let words: Vec<String> = line
+                .split(|byte| *byte == 0)
+                .map(|word| String::from_utf8_lossy(word).into_owned())
+                .collect();
             let run_id = words.iter().skip_while(|word| *word != "--run-id").nth(1).cloned();
             if let (Some(role), Some(run_id)) = (words.get(1), run_id) {
                 members.push(Member { pid, role: role.clone(), run_id });

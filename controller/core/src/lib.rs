@@ -36,6 +36,7 @@ pub(crate) mod kernels;
 pub mod lq_problem;
 pub mod model;
 pub mod node_kinematics;
+mod panel;
 pub mod plan;
 pub mod posture_goal;
 pub mod projected_qp;

@@ -13,8 +13,7 @@ pub fn monotonic_ns() -> u64 {
 
 /// Sleeps until the monotonic clock shows `time_ns`; returns at once when it does already.
 pub fn sleep_until(time_ns: u64) {
-    let until =
-        Timespec { tv_sec: (time_ns / SECOND_NS) as i64, tv_nsec: (time_ns % SECOND_NS) as _ };
+    let until = Timespec { tv_sec: (time_ns / SECOND_NS) as i64, tv_nsec: (time_ns % SECOND_NS) as _ };
     while monotonic_ns() < time_ns {
         // Interrupted by a signal: the loop sleeps on.
         if let Err(rustix::io::Errno::INVAL) = clock_nanosleep_absolute(ClockId::Monotonic, &until) {

@@ -159,6 +159,22 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
         }
     }
 
+    /// Answers the next state if it is there: one turn of the lockstep loop, for a caller that has a loop of its own.
+    ///
+    /// # Errors
+    /// When a link breaks.
+    pub fn answer(&mut self, controller: &mut impl Controller) -> Result<(), LinkError> {
+        if self.receive()? && !self.plant_is_done() {
+            self.cycle(controller, 0)?;
+        }
+        Ok(())
+    }
+
+    /// The figures of the cycles so far.
+    pub fn figures(&self) -> &CycleFigures {
+        &self.figures
+    }
+
     /// Takes the latest state; says whether it is a new one.
     fn receive(&mut self) -> Result<bool, LinkError> {
         match self.states.receive_latest()? {
@@ -222,7 +238,6 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
         Ok(sent_ns)
     }
 }
-
 
 /// Says which state a command answers, and numbers it.
 pub fn address(command: &mut Command, state: &PlantState) {

@@ -2,7 +2,7 @@
 
 use delmpc_scenario::ProcessSettings;
 use rustix::mm::{MlockAllFlags, mlockall};
-use rustix::process::{Resource, getrlimit, geteuid};
+use rustix::process::{Resource, geteuid, getrlimit};
 use rustix::thread::{CpuSet, sched_setaffinity};
 use thread_priority::{
     RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue, ThreadSchedulePolicy,
@@ -33,7 +33,8 @@ pub fn prepare(settings: &ProcessSettings, core: Option<usize>) -> Vec<String> {
         }
     }
     if settings.priority > 0 && !raise_priority(settings.priority) {
-        let message = "no real-time priority (CAP_SYS_NICE or RLIMIT_RTPRIO): other programs may delay a cycle";
+        let message =
+            "no real-time priority (CAP_SYS_NICE or RLIMIT_RTPRIO): other programs may delay a cycle";
         warnings.push(message.to_owned());
     }
     warnings

@@ -108,7 +108,6 @@ impl Membership {
     pub fn node(&self) -> &RunNode {
         &self.node
     }
-
 }
 
 impl Attendance for Membership {

@@ -166,14 +166,17 @@ impl Assembly<'_> {
                     | ModelError::InertiaTriangle { .. }
                     | ModelError::InertiaWithoutMass { .. }
             );
-            if !repairable || self.options.impossible_inertia == ImpossibleInertia::Refuse {
-                return Err(self.refuse_link(link, Rule::Physics(error)));
-            }
-            given = inertia::repair(&given);
-            let warning = format!(
-                "{}. The nearest possible inertia is used",
-                self.refuse_link(link, Rule::Physics(error))
-            );
+            // Only the triangle inequality is a property of real bodies alone; the rest the mathematics needs as well.
+            let acceptable = matches!(error, ModelError::InertiaTriangle { .. });
+            let used = match self.options.impossible_inertia {
+                ImpossibleInertia::Repair if repairable => {
+                    given = inertia::repair(&given);
+                    "The nearest possible inertia is used"
+                }
+                ImpossibleInertia::Accept if acceptable => "It is used all the same",
+                _ => return Err(self.refuse_link(link, Rule::Physics(error))),
+            };
+            let warning = format!("{}. {used}", self.refuse_link(link, Rule::Physics(error)));
             self.warnings.push(warning.replace(" Remedy:", ""));
         }
         let group = &mut self.groups[group];
@@ -386,6 +389,9 @@ impl Assembly<'_> {
             builder.set_ground_inertia(self.groups[0].inertia.transformed(ground));
             builder
         };
+        if self.options.impossible_inertia == ImpossibleInertia::Accept {
+            builder.accept_unreal_inertia();
+        }
         for group in &self.groups[1..] {
             let mut joint = group.joint;
             let parent = match group.parent {

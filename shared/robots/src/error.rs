@@ -200,7 +200,7 @@ impl Rule {
                 "give a value that is not negative"
             }
             Self::Physics(_) => {
-                "correct the inertia (about the mass centre, kg m^2), or load with ImpossibleInertia::Repair"
+                "correct the inertia (about the mass centre, kg m^2), or have it accepted (--accept-impossible-inertia)"
             }
             Self::UnsupportedJoint { .. } => {
                 "use revolute, continuous, prismatic, planar or fixed joints; a floating joint only from an empty root link"

@@ -34,6 +34,8 @@ pub enum ImpossibleInertia {
     Refuse,
     /// Take the nearest possible inertia and say so in [`RobotModel::warnings`].
     Repair,
+    /// Take it as it is and say so in [`RobotModel::warnings`]: the mathematics goes through, the robot is not of this world.
+    Accept,
 }
 
 /// Where the companion file is.

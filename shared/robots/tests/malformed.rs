@@ -123,9 +123,14 @@ fn an_impossible_inertia_can_be_repaired_with_a_warning() {
     assert!(model.warnings[0].contains("link `b`"), "{}", model.warnings[0]);
     let moments = model.tree.bodies()[1].inertia.inertia.diagonal();
     assert!((moments.x - 4.0 / 3.0).abs() < 1e-12 && (moments.z - 8.0 / 3.0).abs() < 1e-12);
+    let accept = LoadOptions { impossible_inertia: ImpossibleInertia::Accept, ..LoadOptions::default() };
+    let model = load_str("broken.urdf", &urdf, None, &accept).unwrap();
+    assert_eq!(model.tree.bodies()[1].inertia.inertia.diagonal().z, 3.0);
+    assert!(model.warnings[0].contains("used all the same"), "{}", model.warnings[0]);
     // A negative mass is not a matter of round-off.
     let urdf = with_link(&inertial(-1.0, 1.0, 1.0, 1.0));
     assert!(load_str("broken.urdf", &urdf, None, &options).is_err());
+    assert!(load_str("broken.urdf", &urdf, None, &accept).is_err());
 }
 
 #[test]

@@ -30,6 +30,6 @@ mod scenario;
 pub use document::Document;
 pub use error::{Place, ScenarioError};
 pub use scenario::{
-    Clock, ConstraintSettings, ControllerKind, ControllerSettings, PlantSettings, ProcessSettings, PushSettings,
-    ReachSettings, RobotSettings, Scenario, SensorSettings, SuccessSettings, WeightSettings,
+    Clock, ConstraintSettings, ControllerKind, ControllerSettings, PlantSettings, ProcessSettings,
+    PushSettings, ReachSettings, RobotSettings, Scenario, SensorSettings, SuccessSettings, WeightSettings,
 };

@@ -35,6 +35,12 @@ pub trait Subscriber<T> {
     fn receive_latest(&mut self) -> Result<Option<&T>, LinkError>;
 }
 
+impl<T, S: Subscriber<T> + ?Sized> Subscriber<T> for &mut S {
+    fn receive_latest(&mut self) -> Result<Option<&T>, LinkError> {
+        (**self).receive_latest()
+    }
+}
+
 impl<T, P: Publisher<T> + ?Sized> Publisher<T> for Box<P> {
     fn send(&mut self, message: &T) -> Result<(), LinkError> {
         (**self).send(message)

@@ -1,0 +1,169 @@
+//! Dense panels for the Riccati recursion: columns of whole registers, and the few products it needs of them.
+//!
+//! A panel is a matrix stored by columns, its rows padded with zeros to a multiple of eight doubles and aligned to cache lines,
+//! so that every instruction set loads whole registers and no kernel has a remainder loop over rows. The products have one shape,
+//!
+//! ```text
+//! C += A Bᵀ        C(i, j) += Σ_l A(i, l) B(j, l)
+//! ```
+//!
+//! computed in tiles of `R` registers by six columns that stay in registers while `l` runs: per `l`, `R` loads and six
+//! broadcasts feed `6 R` multiply-adds. Products with a symmetric matrix fit that shape as well (`P = Pᵀ`).
+//!
+//! Source: K. Goto, R. van de Geijn, *Anatomy of high-performance matrix multiplication*, ACM TOMS 34, 2008; column panels for
+//! small matrices: G. Frison et al., *BLASFEO*, ACM TOMS 44, 2018.
+
+use alloc::vec;
+use alloc::vec::Vec;
+
+use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
+use faer::MatRef;
+use pulp::Simd;
+
+/// Doubles in a block: the widest register.
+pub(crate) const BLOCK: usize = 8;
+/// Columns of a tile.
+pub(crate) const TILE: usize = 6;
+
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(C, align(64))]
+struct Block([f64; BLOCK]);
+
+/// Rows rounded up to whole blocks.
+pub(crate) const fn padded(rows: usize) -> usize {
+    rows.div_ceil(BLOCK) * BLOCK
+}
+
+/// A matrix in padded columns. Rows beyond `rows` are zero unless a kernel documents otherwise.
+#[derive(Clone, Debug)]
+pub(crate) struct Panel {
+    data: Vec<Block>,
+    /// Doubles from a column to the next.
+    stride: usize,
+    columns: usize,
+}
+
+impl Panel {
+    /// Zeros. `rows` is rounded up.
+    pub fn zeros(rows: usize, columns: usize) -> Self {
+        let stride = padded(rows);
+        // A tile may read up to five rows beyond the last column's end.
+        Self { data: vec![Block([0.0; BLOCK]); stride / BLOCK * columns + 1], stride, columns }
+    }
+
+    /// Doubles from a column to the next: the padded number of rows.
+    pub fn stride(&self) -> usize {
+        self.stride
+    }
+
+    /// All entries, column after column.
+    pub fn entries(&self) -> &[f64] {
+        cast_slice(&self.data)
+    }
+
+    /// All entries, to write.
+    pub fn entries_mut(&mut self) -> &mut [f64] {
+        cast_slice_mut(&mut self.data)
+    }
+
+    /// One padded column.
+    pub fn column(&self, column: usize) -> &[f64] {
+        &self.entries()[column * self.stride..][..self.stride]
+    }
+
+    /// One padded column, to write.
+    pub fn column_mut(&mut self, column: usize) -> &mut [f64] {
+        let stride = self.stride;
+        &mut self.entries_mut()[column * stride..][..stride]
+    }
+
+    /// The first `rows` rows as a matrix.
+    pub fn view(&self, rows: usize) -> MatRef<'_, f64> {
+        MatRef::from_column_major_slice_with_stride(self.entries(), rows, self.columns, self.stride)
+    }
+
+    /// The registers of an instruction set, column after column.
+    #[inline(always)]
+    pub fn registers<S: Simd>(&self) -> &[S::f64s] {
+        cast_slice(&self.data)
+    }
+
+    /// The registers, to write.
+    #[inline(always)]
+    pub fn registers_mut<S: Simd>(&mut self) -> &mut [S::f64s] {
+        cast_slice_mut(&mut self.data)
+    }
+}
+
+/// Sums in registers: six columns of `R` registers.
+pub(crate) type Tile<S, const R: usize> = [[<S as Simd>::f64s; R]; TILE];
+
+/// A tile of zeros.
+#[inline(always)]
+pub(crate) fn zero_tile<S: Simd, const R: usize>(simd: S) -> Tile<S, R> {
+    [[simd.splat_f64s(0.0); R]; TILE]
+}
+
+/// `tile(r, c) += Σ_l a(row + r, l) b(column + c, l)`, `row` in registers, `column` in doubles, over `depth` columns of both.
+#[inline(always)]
+pub(crate) fn accumulate<S: Simd, const R: usize>(
+    simd: S,
+    tile: &mut Tile<S, R>,
+    (a, row): (&Panel, usize),
+    (b, column): (&Panel, usize),
+    depth: usize,
+) {
+    let a_stride = a.stride / S::F64_LANES;
+    let (a, b_entries) = (a.registers::<S>(), b.entries());
+    let mut sums = *tile;
+    for l in 0..depth {
+        let a = &a[l * a_stride + row..][..R];
+        let b = &b_entries[l * b.stride + column..][..TILE];
+        for c in 0..TILE {
+            let factor = simd.splat_f64s(b[c]);
+            for r in 0..R {
+                sums[c][r] = simd.mul_add_f64s(a[r], factor, sums[c][r]);
+            }
+        }
+    }
+    *tile = sums;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Product<'a>(&'a Panel, &'a Panel, usize);
+
+    impl pulp::WithSimd for Product<'_> {
+        type Output = Vec<f64>;
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, simd: S) -> Vec<f64> {
+            let Product(a, b, depth) = self;
+            let mut tile = zero_tile::<S, 1>(simd);
+            accumulate(simd, &mut tile, (a, 0), (b, 3), depth);
+            tile.iter().map(|column| cast_slice::<S::f64s, f64>(column)[0]).collect()
+        }
+    }
+
+    #[test]
+    fn a_tile_is_the_product_of_two_panels() {
+        let fill = |seed: f64| {
+            let mut panel = Panel::zeros(13, 5);
+            for column in 0..5 {
+                for row in 0..13 {
+                    panel.column_mut(column)[row] = (seed + row as f64) * 0.3 - column as f64;
+                }
+            }
+            panel
+        };
+        let (a, b) = (fill(1.0), fill(-2.0));
+        let product = pulp::Arch::new().dispatch(Product(&a, &b, 5));
+        for (c, value) in product.iter().enumerate() {
+            let expected: f64 = (0..5).map(|l| a.column(l)[0] * b.column(l)[3 + c]).sum();
+            assert!((value - expected).abs() < 1e-12);
+        }
+        assert_eq!(a.stride(), 16);
+        assert_eq!(a.view(13)[(12, 4)], a.column(4)[12]);
+    }
+}
