@@ -80,6 +80,8 @@ pub mod reroot;
 pub mod row_matrix;
 pub(crate) mod small_inverse;
 pub mod spatial;
+pub mod stage_batch;
+pub(crate) mod stage_lanes;
 pub mod state;
 pub mod step;
 pub mod tangent;

@@ -192,3 +192,41 @@ fn warm_linearisations_and_adjoint_products_take_no_memory() {
         }
     }
 }
+
+#[test]
+fn warm_batches_of_stages_take_no_memory() {
+    use delmpc_mechanics::stage_batch::{InstructionSet, StageBatch, StageInput, TransitionSlice};
+    let tree = spatial_chain(GRAVITY, Forces::Springs);
+    let (n, stages) = (tree.dof(), 9);
+    let (q, rate, force) = (spread(n, 0.4), spread(n, 0.5), spread(n, 0.3));
+    let mut values = vec![0.0; stages * 6 * n * n];
+    let mut end = vec![0.0; 2 * n];
+    for set in [InstructionSet::Portable, InstructionSet::Avx2, InstructionSet::Avx512] {
+        let rule = LobattoRule::new(2).unwrap();
+        let Ok(mut batch) = StageBatch::with_instructions(&tree, &rule, stages, set) else { continue };
+        none(&format!("{set:?}"), || {
+            for k in 0..stages {
+                let input = StageInput { nodes: [&q; 3], rate: &rate, force: &force, time_step: 0.02 };
+                batch.set_stage(k, &input).unwrap();
+            }
+            batch.set_end_node(&q, &rate).unwrap();
+            batch.iterate(2);
+            let mut output =
+                TransitionSlice { values: &mut values, stage_stride: 6 * n * n, column_stride: 2 * n };
+            batch.linearize(&mut output).unwrap();
+            for k in 0..stages {
+                batch.outcome(k).unwrap();
+                batch.end_state_into(k, &mut end).unwrap();
+                batch.set_deviation(k, &force, &q, &rate).unwrap();
+            }
+            batch.move_interior();
+            batch.interior_node_into(0, &mut end[..n]).unwrap();
+        });
+        let bad = StageInput { nodes: [&q; 3], rate: &rate, force: &[f64::NAN; 3], time_step: 0.02 };
+        none(&format!("{set:?}: bad stage"), || {
+            batch.set_stage(1, &bad).unwrap();
+            batch.iterate(1);
+            assert!(batch.outcome(1).is_err());
+        });
+    }
+}
