@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand};
 
 use crate::model::ModelArguments;
+use crate::push_map::PushMapArguments;
 use crate::replay::ReplayArguments;
 
 /// What `--help` shows at its end.
@@ -14,6 +15,7 @@ Examples:
   delmpc run --set seed=7 --set push.impulse_ns=20
   delmpc run configs/scenarios/atlas_one_foot.toml --set clock=lockstep --json
   delmpc model configs/robots/atlas.urdf
+  delmpc push-map --controller mpc,static-lqr --directions 8
   delmpc replay runs/latest --verify
 
 Exit status: 0 success; 1 a success criterion was missed; 2 usage, configuration or model error; 3 fault (a process
@@ -45,6 +47,8 @@ pub enum Command {
     Controller(PartArguments),
     /// Check a robot model; print its table or, with --at, everything computed from it
     Model(ModelArguments),
+    /// Find the largest push survived in every direction: table, JSON, polar plot
+    PushMap(PushMapArguments),
     /// Run again from the log of a run and compare bit by bit
     Replay(ReplayArguments),
 }

@@ -1,6 +1,6 @@
 //! The command `delmpc`: its parts as a library, so that tests can use them without a terminal.
 //!
-//! One file per subcommand ([`run`], [`plant`], [`controller`], [`model`], [`replay`]); what they share:
+//! One file per subcommand ([`run`], [`plant`], [`controller`], [`model`], [`replay`], [`push_map`]); what they share:
 //!
 //! | file | what it does |
 //! |---|---|
@@ -28,6 +28,7 @@ pub mod one_process;
 pub mod part;
 pub mod plant;
 pub mod plant_process;
+pub mod push_map;
 pub mod replay;
 pub mod robot_controller;
 pub mod run;

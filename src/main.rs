@@ -20,6 +20,7 @@ fn main() -> ExitCode {
         Command::Plant(arguments) => delmpc::plant::plant(&arguments),
         Command::Controller(arguments) => delmpc::controller::controller(&arguments, allocations),
         Command::Model(arguments) => delmpc::model::model(&arguments),
+        Command::PushMap(arguments) => delmpc::push_map::push_map(&arguments),
         Command::Replay(arguments) => delmpc::replay::replay(&arguments),
     })
 }

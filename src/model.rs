@@ -256,8 +256,7 @@ fn step(
     let rule = LobattoRule::new(nodes).map_err(|error| error.to_string())?;
     // Whoever asks about one step may ask about a wild one.
     let options = StepOptions { turn_limit: f64::INFINITY, ..StepOptions::default() };
-    let mut integrator =
-        Integrator::new(tree, &rule, dt, options).map_err(|error| error.to_string())?;
+    let mut integrator = Integrator::new(tree, &rule, dt, options).map_err(|error| error.to_string())?;
     let inputs: Vec<f64>;
     let forces = match (&question.u, &question.u_nodes) {
         (Some(_), Some(_)) => return Err("both `u` and `u_nodes`: give one".to_owned()),

@@ -65,7 +65,8 @@ pub fn simulate(setup: &Setup, log: Log, stop: &StopFlag) -> Result<Simulated, F
     let (commands, commands_in) = in_process_link::<Command>();
     let controller_loop =
         ControllerLoop::new(scenario, states_in, commands, &Command::new(run, hash, joints));
-    let mut answers = Answers { controller_loop, controller: RobotController::new(setup)?, commands: commands_in };
+    let mut answers =
+        Answers { controller_loop, controller: RobotController::new(setup)?, commands: commands_in };
     let blank = PlantState::new(run, hash, joints);
     let plant_loop = PlantLoop::new(scenario, states, &mut answers, &blank, log);
     match plant_loop.run(&mut robot, &mut Alone(stop.clone())) {
