@@ -6,6 +6,7 @@ use clap::{Args, Parser, Subcommand};
 
 use crate::model::ModelArguments;
 use crate::replay::ReplayArguments;
+use crate::report::ReportArguments;
 
 /// What `--help` shows at its end.
 const EXAMPLES: &str = "\
@@ -47,6 +48,8 @@ pub enum Command {
     Model(ModelArguments),
     /// Run again from the log of a run and compare bit by bit
     Replay(ReplayArguments),
+    /// Make report.html and the plots of a run again from its files
+    Report(ReportArguments),
 }
 
 /// Options of `delmpc run`.
@@ -64,6 +67,9 @@ pub struct RunOptions {
     /// Print the summary as one JSON object and nothing else
     #[arg(long)]
     pub json: bool,
+    /// Do not write report.html and the plots
+    #[arg(long)]
+    pub no_report: bool,
     /// Both parts in one process: deterministic, for debugging; needs the lockstep clock
     #[arg(long)]
     pub one_process: bool,

@@ -1,6 +1,7 @@
 //! The command `delmpc`: its parts as a library, so that tests can use them without a terminal.
 //!
-//! One file per subcommand ([`run`], [`plant`], [`controller`], [`model`], [`replay`]); what they share:
+//! One file per subcommand ([`run`], [`plant`], [`controller`], [`model`], [`replay`],
+//! [`mod@report`]); what they share:
 //!
 //! | file | what it does |
 //! |---|---|
@@ -16,6 +17,7 @@
 //! | [`truth`], [`observer`], [`metrics`], [`sole`] | what happened, and the figures made of it |
 //! | [`summary`] | all figures, success, the table a person reads |
 //! | [`log`] | the log of states, commands and truth |
+//! | [`mod@report`] | the run to look at: `report.html` and pictures of the key plots |
 //! | [`status_line`] | one line about the running run |
 
 pub mod cli;
@@ -29,6 +31,7 @@ pub mod part;
 pub mod plant;
 pub mod plant_process;
 pub mod replay;
+pub mod report;
 pub mod robot_controller;
 pub mod run;
 pub mod run_folder;
