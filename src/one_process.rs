@@ -11,7 +11,7 @@ use crate::log::Log;
 use crate::part::{leave_part, message_run_id};
 use crate::robot_controller::RobotController;
 use crate::simulated_robot::SimulatedRobot;
-use crate::plant::about;
+use crate::plant::log_head;
 use crate::plant_process::PlantLoop;
 use crate::run_folder::{CONTROLLER_PART, PLANT_PART, RunFolder};
 use crate::setup::Setup;
@@ -26,7 +26,7 @@ pub fn run_in_one_process(setup: &Setup, folder: &RunFolder, stop: &StopFlag) ->
     let scenario = &setup.scenario;
     let mut robot = SimulatedRobot::new(setup)?;
     let mut controller = RobotController::new(setup)?;
-    let log = Log::create(&folder.file("log.mcap"), about(setup, RunId(0)), true)?;
+    let log = Log::create(&folder.file("log.mcap"), log_head(setup, RunId(0)), true)?;
     let (run, hash) = (message_run_id(RunId(0), scenario), setup.joint_set_hash());
     let joints = setup.robot.joint_names.len() as u32;
     let (states, states_in) = in_process_link::<PlantState>();

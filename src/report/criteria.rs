@@ -64,20 +64,20 @@ pub fn criteria(scenario: &Scenario, summary: &Value) -> Vec<Criterion> {
     };
     if scenario.reach.is_some() {
         let bound = limit.hand_error_at_deadline_m;
-        compare("Hand to ball at the deadline", "hand_error_at_deadline_m", true, bound, &millimetres);
+        compare("Hand at the deadline", "hand_error_at_deadline_m", true, bound, &millimetres);
         let bound = limit.hand_error_hold_max_m;
-        compare("Hand to ball while holding", "hand_error_hold_max_m", true, bound, &millimetres);
+        compare("Hand while holding", "hand_error_hold_max_m", true, bound, &millimetres);
     }
     compare("Stance slip", "max_stance_slip_m", true, limit.max_stance_slip_m, &millimetres);
     compare("Stance tilt", "max_stance_tilt_rad", true, limit.max_stance_tilt_rad, &degrees);
-    compare("Pressure point to edge of sole", "min_cop_margin_m", false, limit.min_cop_margin_m, &millimetres);
-    compare("Largest torque of its limit", "max_torque_ratio", true, limit.max_torque_ratio, &percent);
+    compare("Pressure point to edge", "min_cop_margin_m", false, limit.min_cop_margin_m, &millimetres);
+    compare("Torque of its limit", "max_torque_ratio", true, limit.max_torque_ratio, &percent);
     if scenario.push.iter().any(|push| push.impulse_ns > 0.0 && push.start_s < scenario.duration_s) {
         compare("Push to rest", "settle_time_s", true, limit.settle_time_s, &seconds);
     }
     if scenario.clock == Clock::Realtime {
         let bound = limit.min_real_time_factor;
-        compare("Simulated over wall time", "plant_real_time_factor", false, bound, &factor);
+        compare("Simulated per wall time", "plant_real_time_factor", false, bound, &factor);
     }
     list
 }
@@ -94,9 +94,9 @@ mod tests {
         let list = criteria(&scenario, &summary);
         let found = |name: &str| list.iter().find(|criterion| criterion.name == name).unwrap();
         assert_eq!((found("No fall").met, found("No fall").value.as_str()), (Some(true), "stood"));
-        assert_eq!(found("Largest torque of its limit").met, Some(false));
+        assert_eq!(found("Torque of its limit").met, Some(false));
         assert_eq!((found("Stance slip").met, found("Stance slip").value.as_str()), (Some(true), "1.0 mm"));
-        assert_eq!(found("Pressure point to edge of sole").met, None, "nothing was measured");
+        assert_eq!(found("Pressure point to edge").met, None, "nothing was measured");
         assert!(list.iter().all(|criterion| criterion.name != "Push to rest"), "there is no push");
     }
 }

@@ -257,7 +257,7 @@ fn cycle_time(setup: &Setup, recording: &Recording) -> Result<Canvas, CanvasErro
     let deadline = 1e3 / setup.scenario.controller.mpc_rate_hz;
     let mut totals: Vec<f64> = (0..cycles["total"].rows()).map(|row| cycles["total"].at(row, 0)).collect();
     totals.sort_by(f64::total_cmp);
-    let usual = totals.get(totals.len().saturating_sub(1) * 99 / 100).copied().unwrap_or_default();
+    let usual = totals.get(totals.len().saturating_sub(1) * 95 / 100).copied().unwrap_or_default();
     let y = [0.0, (1.3 * deadline).max(1.15 * usual.min(12.0 * deadline))];
     let mut legend: Vec<(&str, Colour)> = names.into_iter().zip(colours).collect();
     legend.push(("deadline", INK));

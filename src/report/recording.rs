@@ -113,8 +113,7 @@ impl Recording {
 /// What the log says about its run: the first record of metadata.
 fn about(log: &[u8]) -> BTreeMap<String, String> {
     let records = LinearReader::new(log).into_iter().flatten().map_while(Result::ok);
-    let before_content = records.take_while(|record| !matches!(record, Record::Chunk { .. }));
-    let mut metadata = before_content.filter_map(|record| match record {
+    let mut metadata = records.filter_map(|record| match record {
         Record::Metadata(metadata) => Some(metadata.metadata),
         _ => None,
     });

@@ -14,7 +14,7 @@ function meshOfQuads(quads) {
 // A box with rounded edges: every point is an inner point plus the radius times the normal.
 function boxMesh([sx, sy, sz]) {
   const half = [sx / 2, sy / 2, sz / 2];
-  const radius = Math.min(0.018, 0.22 * Math.min(sx, sy, sz));
+  const radius = Math.min(0.06, 0.2 * Math.min(sx, sy, sz));
   const quads = [];
   const corner = (p) => {
     const inner = p.map((x, i) => Math.max(-(half[i] - radius), Math.min(half[i] - radius, x)));
@@ -25,11 +25,11 @@ function boxMesh([sx, sy, sz]) {
   };
   for (let axis = 0; axis < 3; axis++) {
     const u = (axis + 1) % 3, v = (axis + 2) % 3;
-    const lines = (i) => [-half[i], -half[i] + 0.42 * radius, -half[i] + radius, half[i] - radius, half[i] - 0.42 * radius, half[i]];
+    const lines = (i) => [-half[i], -half[i] + 0.25 * radius, -half[i] + 0.6 * radius, -half[i] + radius, half[i] - radius, half[i] - 0.6 * radius, half[i] - 0.25 * radius, half[i]];
     const us = lines(u), vs = lines(v);
     for (const sign of [-1, 1]) {
-      for (let i = 0; i < 5; i++) {
-        for (let j = 0; j < 5; j++) {
+      for (let i = 0; i < 7; i++) {
+        for (let j = 0; j < 7; j++) {
           const at = (a, b) => {
             const p = [0, 0, 0];
             p[axis] = sign * half[axis]; p[u] = us[a]; p[v] = vs[b];

@@ -5,11 +5,7 @@ const clean = (text) => text.replace("-", "−");
 
 // Colours of the scene, from the style of the page.
 function sceneColours() {
-  const style = getComputedStyle(document.documentElement);
-  const rgb = (name) => {
-    const text = style.getPropertyValue(name).trim();
-    return [1, 3, 5].map((i) => parseInt(text.slice(i, i + 2), 16) / 255);
-  };
+  const rgb = (name) => styleColour(name).map((x) => x / 255);
   const names = ["background", "grid", "body", "sole", "com", "capture", "pressure", "push", "ball"];
   const colours = Object.fromEntries(names.map((name) => [name, rgb(`--scene-${name}`)]));
   colours.shadow = [...rgb("--scene-shadow"), 0.2];
@@ -51,7 +47,7 @@ class Page {
   }
 
   moveCamera(button) {
-    const views = { quarter: [0.75, 0.22], front: [0.02, 0.12], side: [1.55, 0.12], top: [Math.PI, 1.5] };
+    const views = { quarter: [0.95, 0.16], front: [0.02, 0.12], side: [1.55, 0.12], top: [Math.PI, 1.5] };
     if (button.dataset.zoom) this.view.zoom(+button.dataset.zoom);
     const view = views[button.dataset.view];
     if (view) [this.view.camera.azimuth, this.view.camera.elevation] = view;
@@ -137,6 +133,7 @@ class Page {
       if (now === "auto") delete document.documentElement.dataset.theme; else document.documentElement.dataset.theme = now;
       button.textContent = now[0].toUpperCase() + now.slice(1);
       this.colours = sceneColours();
+      this.plots.torque_map?.draw();
       this.request();
     };
     button.addEventListener("click", () => { now = order[(order.indexOf(now) + 1) % 3]; apply(); });

@@ -1,6 +1,6 @@
 // Plots over time, all with the same time axis and one cursor.
 
-const LEFT = 52, RIGHT = 12, TOP = 8, BOTTOM = 24;
+const LEFT = 58, RIGHT = 12, TOP = 8, BOTTOM = 24;
 
 // Round numbers that cover a range.
 function ticks(low, high, count) {
@@ -71,9 +71,8 @@ class Plot {
     for (const time of ticks(axis.from, axis.to, width / 80)) {
       const x = this.x(time);
       grid.append(element("line", { x1: x, x2: x, y1: TOP, y2: bottom }));
-      labels.append(element("text", { x, y: height - 8, "text-anchor": "middle" }, String(time).replace("-", "−")));
+      labels.append(element("text", { x, y: height - 8, "text-anchor": "middle" }, `${String(time).replace("-", "−")} s`));
     }
-    labels.append(element("text", { x: right, y: height - 8, class: "unit", "text-anchor": "end", dx: 0 }, ""));
     const levels = this.categories ? [] : this.log ? this.decades() : ticks(this.low, this.high, (bottom - TOP) / 34);
     for (const value of levels) {
       const y = this.y(value);
@@ -266,7 +265,7 @@ function makePlots(parent, axis, seek) {
   // Torques relative to their limits: every joint a row, the darker the closer.
   const limited = run.robot.joints.map((joint, i) => ({ ...joint, index: i })).filter((joint) => joint.effort);
   if (limited.length) {
-    const ROW = 9;
+    const ROW = 13;
     let chosen = null;
     const peak = (joint) => {
       let most = 0;
@@ -282,6 +281,7 @@ function makePlots(parent, axis, seek) {
     map.content = (inside, svg) => {
       const columns = Math.max(1, Math.min(900, Math.round(map.width - LEFT - RIGHT)));
       const canvas = element("canvas", { width: columns, height: limited.length }), paper = canvas.getContext("2d");
+      const stops = ["--ramp0", "--ramp5", "--ramp10"].map(styleColour);
       const picture = paper.createImageData(columns, limited.length);
       for (let k = 0; k < columns && frames.rows; k++) {
         const from = frames.rowAt(axis.from + (k / columns) * (axis.to - axis.from));
@@ -290,13 +290,13 @@ function makePlots(parent, axis, seek) {
         limited.forEach((joint, row) => {
           let most = 0;
           for (let f = from; f < Math.min(until, frames.rows); f++) most = Math.max(most, Math.abs(frames.at("torque", f, joint.index)));
-          picture.data.set(past ? [0, 0, 0, 0] : [...ramp(most / joint.effort), 255], 4 * (row * columns + k));
+          picture.data.set(past ? [0, 0, 0, 0] : [...ramp(most / joint.effort, stops), 255], 4 * (row * columns + k));
         });
       }
       paper.putImageData(picture, 0, 0);
       inside.append(element("image", { href: canvas.toDataURL(), x: LEFT, y: TOP, width: map.width - LEFT - RIGHT, height: ROW * limited.length, preserveAspectRatio: "none", style: "image-rendering: pixelated" }));
       limited.forEach((joint, row) => {
-        const label = element("text", { class: `joint ${joint === chosen ? "chosen" : ""}`, x: LEFT - 3, y: TOP + ROW * row + 7.2, "text-anchor": "end" }, joint.name.slice(0, 11));
+        const label = element("text", { class: `joint ${joint === chosen ? "chosen" : ""}`, x: LEFT - 3, y: TOP + ROW * row + 9.8, "text-anchor": "end" }, joint.name);
         label.addEventListener("pointerdown", (event) => { event.stopPropagation(); choose(joint); });
         svg.append(label);
         if (joint === chosen) svg.append(element("rect", { class: "chosen-row", x: LEFT, y: TOP + ROW * row, width: map.width - LEFT - RIGHT, height: ROW }));
@@ -341,12 +341,12 @@ function makePlots(parent, axis, seek) {
     const made = plot("cycle", {
       title: "Cycle time", unit: "ms", height: 200,
       note: run.timed ? "" : "a lockstep run has no wall clock",
-      legend: [...names.map((name, k) => ({ name, mark: `s${k}`, kind: "swatch", read: run.timed ? read(cycles, value(cycles, parts[k]), 2) : undefined })), { name: "deadline", mark: "limit" }],
-      range: () => [0, Math.max(1.3 * deadline, 1.15 * Math.min(quantile(cycles, "total", 0.99) || 0, 12 * deadline))],
+      legend: [...names.map((name, k) => ({ name, mark: `s${k}`, kind: "swatch", read: run.timed ? read(cycles, value(cycles, parts[k]), 2) : undefined })), { name: `deadline ${deadline} ms`, mark: "limit" }],
+      range: () => [0, Math.max(1.3 * deadline, 1.15 * Math.min(quantile(cycles, "total", 0.95) || 0, 12 * deadline))],
     });
     made.content = (inside) => {
       for (let k = parts.length - 1; k >= 0; k--) made.line(inside, cycles, `s${k}`, upTo[k], { step: true, area: true });
-      made.level(inside, deadline, "limit", `deadline ${deadline} ms`);
+      made.level(inside, deadline, "limit");
       let beyond = 0;
       for (let row = 0; row < cycles.rows; row++) {
         if (cycles.at("total", row) <= made.high) continue;
@@ -403,15 +403,20 @@ function makePlots(parent, axis, seek) {
   return plots;
 }
 
-// Pale to dark blue, then orange for what is over: told apart by lightness alone.
-function ramp(part) {
+// A byte triple of a colour of the style.
+function styleColour(name) {
+  const text = getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  return [1, 3, 5].map((i) => parseInt(text.slice(i, i + 2), 16));
+}
+
+// From the colour of nothing to that of the whole, then orange for what is over: told apart by lightness alone.
+function ramp(part, stops) {
   if (part > 1.0001) return [213, 94, 0];
-  const stops = [[240, 244, 248], [190, 211, 230], [116, 164, 205], [44, 110, 166], [16, 58, 102], [6, 24, 48]];
   const at = Math.max(0, Math.min(1, part)) * (stops.length - 1), k = Math.min(stops.length - 2, Math.floor(at));
   return stops[k].map((x, i) => Math.round(x + (at - k) * (stops[k + 1][i] - x)));
 }
 
-// The sole from above, toes up: where the pressure goes.
+// The sole from above, toes to the right: where the pressure goes.
 class SolePicture {
   constructor(parent) {
     this.svg = element("svg", { class: "sole", role: "img", "aria-label": "Pressure point in the stance sole" });
@@ -419,8 +424,8 @@ class SolePicture {
     this.sole = run.robot.soles[run.stance];
     if (!this.sole) return;
     const xs = this.sole.polygon.map((p) => p[0]), ys = this.sole.polygon.map((p) => p[1]);
-    const room = 0.035;
-    this.box = { left: Math.max(...ys) + room, top: Math.max(...xs) + room, width: Math.max(...ys) - Math.min(...ys) + 2 * room, height: Math.max(...xs) - Math.min(...xs) + 2 * room };
+    const room = 0.022;
+    this.box = { left: Math.min(...xs) - room, top: Math.max(...ys) + room, width: Math.max(...xs) - Math.min(...xs) + 2 * room, height: Math.max(...ys) - Math.min(...ys) + 2 * room };
     this.svg.setAttribute("viewBox", `0 0 ${1e3 * this.box.width} ${1e3 * this.box.height}`);
     const polygon = (margin, mark) => {
       const n = this.sole.polygon.length;
@@ -436,13 +441,13 @@ class SolePicture {
     this.all = element("polyline", { class: "trail all" });
     this.recent = element("polyline", { class: "trail recent" });
     this.dots = ["com", "capture", "pressure"].map((mark) => element("circle", { class: mark, r: mark === "com" ? 5 : 4.2 }));
-    const [x, y] = [1e3 * this.box.width - 66, 1e3 * this.box.height - 12];
+    const [x, y] = [1e3 * this.box.width - 72, 1e3 * this.box.height - 9];
     this.svg.append(polygon(0, "whole"), ...(run.cop_margin_m > 0 ? [polygon(run.cop_margin_m, "inner")] : []), this.all, this.recent, ...this.dots,
-      element("line", { class: "scale", x1: x, x2: x + 50, y1: y, y2: y }), element("text", { class: "scale", x: x + 25, y: y - 5, "text-anchor": "middle" }, "50 mm"),
-      element("text", { class: "scale", x: 500 * this.box.width, y: 14, "text-anchor": "middle" }, "toes"));
+      element("line", { class: "scale", x1: x, x2: x + 50, y1: y, y2: y }), element("text", { class: "scale", x: x - 5, y: y + 3, "text-anchor": "end" }, "50 mm"),
+      element("text", { class: "scale", x: 22, y: y + 3 }, "heel"), element("text", { class: "scale", x: 1e3 * this.box.width - 22, y: 14, "text-anchor": "end" }, "toes"));
   }
 
-  at([x, y]) { return [1e3 * (this.box.left - y), 1e3 * (this.box.top - x)]; }
+  at([x, y]) { return [1e3 * (x - this.box.left), 1e3 * (this.box.top - y)]; }
 
   trail(line, from, to) {
     const points = [];

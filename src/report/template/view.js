@@ -15,7 +15,7 @@ void main() {
   float key = max(dot(m, light), 0.0), sky = 0.5 + 0.5 * m.z;
   float back = max(dot(m, normalize(vec3(-light.x, -light.y, 0.35))), 0.0);
   float shine = pow(max(dot(m, normalize(light + v)), 0.0), 38.0);
-  vec3 shaded = colour.rgb * (0.30 + 0.26 * sky + 0.56 * key + 0.14 * back) + 0.13 * shine;
+  vec3 shaded = colour.rgb * (0.40 + 0.30 * sky + 0.56 * key + 0.16 * back) + 0.10 * shine;
   pixel = vec4(mix(colour.rgb, shaded, lit), colour.a);
 }`;
 
@@ -36,8 +36,8 @@ void main() {
 class View {
   constructor(canvas) {
     this.canvas = canvas;
-    this.gl = canvas.getContext("webgl2", { antialias: true, stencil: true, preserveDrawingBuffer: true });
-    this.camera = { azimuth: 0.75, elevation: 0.22, distance: 3.4, target: [0.12, 0, 0.78] };
+    this.gl = canvas.getContext("webgl2", { alpha: false, antialias: true, stencil: true, preserveDrawingBuffer: true });
+    this.camera = { azimuth: 0.95, elevation: 0.16, distance: 3.4, target: [0.12, 0, 0.78] };
     this.meshes = new Map();
     if (this.gl) this.prepare(); else this.paper = canvas.getContext("2d");
     this.listen();
@@ -238,6 +238,16 @@ class View {
       gl.uniform4f(this.solid.at.colour, ...item.colour, item.alpha ?? 1);
       send(item);
     }
+    // Forces inside the robot shine through it.
+    gl.depthFunc(gl.GREATER);
+    gl.depthMask(false);
+    for (const item of items.filter(({ through }) => through)) {
+      gl.uniform1f(this.solid.at.lit, 0);
+      gl.uniform4f(this.solid.at.colour, ...item.colour, 0.45);
+      send(item);
+    }
+    gl.depthMask(true);
+    gl.depthFunc(gl.LESS);
   }
 
   // The same by the painter's algorithm: triangles from far to near.
@@ -316,8 +326,8 @@ class Actors {
     const head = Math.min(0.5 * length, 4.2 * thickness), pose = poseAlong(from, vector);
     const neck = moved(pose, [0, 0, length - head]);
     return [
-      { mesh: this.rod, pose, scale: [thickness, thickness, length - head], colour, shadow: false },
-      { mesh: this.cone, pose: [...pose.slice(0, 9), ...neck], scale: [2.3 * thickness, 2.3 * thickness, head], colour },
+      { mesh: this.rod, pose, scale: [thickness, thickness, length - head], colour, through: true },
+      { mesh: this.cone, pose: [...pose.slice(0, 9), ...neck], scale: [2.3 * thickness, 2.3 * thickness, head], colour, through: true },
     ];
   }
 
@@ -344,7 +354,7 @@ class Actors {
         items.push(...this.arrow([foot[0], foot[1], Math.max(0, foot[2])], force, 0.008, colours.pressure));
       }
     }
-    items.push({ mesh: this.bead, pose: [...level, ...motion.com], colour: colours.com });
+    items.push({ mesh: this.bead, pose: [...level, ...motion.com], colour: colours.com, through: true });
     if (run.ball) items.push({ mesh: this.ball, pose: [...level, ...run.ball], colour: colours.ball, shadow: true });
     const push = Math.hypot(...motion.push);
     if (push > 0) {
