@@ -16,12 +16,16 @@
 //! | [`one_process`] | both loops in one process |
 //! | [`truth`], [`observer`], [`metrics`], [`sole`] | what happened, and the figures made of it |
 //! | [`summary`] | all figures, success, the table a person reads |
+//! | [`drawing`] | a robot in its postures as SVG |
+//! | [`completions`] | what a shell needs to complete our words |
 //! | [`log`], [`log_viewer`] | the log of states, commands and truth, and what shows the robot to viewers of logs |
 //! | [`mod@report`] | the run to look at: `report.html` and pictures of the key plots |
 //! | [`status_line`] | one line about the running run |
 
 pub mod cli;
+pub mod completions;
 pub mod controller;
+pub mod drawing;
 pub mod log;
 pub mod log_viewer;
 pub mod metrics;

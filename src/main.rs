@@ -21,6 +21,7 @@ fn main() -> ExitCode {
         Command::Controller(arguments) => delmpc::controller::controller(&arguments, allocations),
         Command::Model(arguments) => delmpc::model::model(&arguments),
         Command::Replay(arguments) => delmpc::replay::replay(&arguments),
+        Command::Completions(arguments) => delmpc::completions::completions(&arguments),
         Command::Report(arguments) => delmpc::report::report(&arguments),
     })
 }

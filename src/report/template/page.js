@@ -187,7 +187,7 @@ class Page {
     this.sole.show(motion);
     const cycle = cycles.rowAt(this.time), row = motion.row;
     const margin = frames.at("margin", row), push = Math.hypot(...motion.push);
-    $("sole-margin").textContent = Number.isFinite(margin) ? `${(1e3 * margin).toFixed(1).replace("-", "−")} mm to the edge` : "in the air";
+    $("sole-margin").textContent = Number.isFinite(margin) ? `${(1e3 * margin).toFixed(1).replace("-", "−")} mm to the edge` : row === 0 ? "" : "in the air";
     const force = Math.hypot(...motion.force);
     const lines = [
       [`${this.time.toFixed(2)} s`, "when"],
