@@ -4,9 +4,11 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
 
+use crate::completions::CompletionsArguments;
 use crate::model::ModelArguments;
 use crate::push_map::PushMapArguments;
 use crate::replay::ReplayArguments;
+use crate::report::ReportArguments;
 
 /// What `--help` shows at its end.
 const EXAMPLES: &str = "\
@@ -17,9 +19,38 @@ Examples:
   delmpc model configs/robots/atlas.urdf
   delmpc push-map --controller mpc,static-lqr --directions 8
   delmpc replay runs/latest --verify
+  delmpc report runs/latest && xdg-open runs/latest/report.html
+  delmpc help run                               everything about a subcommand
 
 Exit status: 0 success; 1 a success criterion was missed; 2 usage, configuration or model error; 3 fault (a process
 was lost, a link broke); 130 interrupted.";
+
+const RUN_EXAMPLES: &str = "\
+Examples:
+  delmpc run                                          the main scenario, in real time
+  delmpc run configs/scenarios/atlas_one_foot.toml --out /tmp/try
+  delmpc run --set push.impulse_ns=20 --set push.direction=[1,0,0]
+  delmpc run --set clock=lockstep --one-process       the same bits every time
+  delmpc run runs/latest/scenario.toml                a run of yesterday again";
+
+const PART_EXAMPLES: &str = "\
+Examples:
+  delmpc plant configs/scenarios/atlas_one_foot.toml --out /tmp/try &
+  delmpc controller configs/scenarios/atlas_one_foot.toml --out /tmp/try";
+
+const MODEL_EXAMPLES: &str = "\
+Examples:
+  delmpc model configs/robots/atlas.urdf
+  delmpc model configs/robots/atlas.urdf --svg atlas.svg
+  delmpc model configs/robots/atlas.urdf --base fixed:r_foot
+  echo '{\"q\": {\"r_leg_kny\": 0.9}, \"dt\": 0.005}' > at.json
+  delmpc model configs/robots/atlas.urdf --at at.json       A, B, mass matrix, step as JSON";
+
+const COMPLETIONS_EXAMPLES: &str = "\
+Examples:
+  delmpc completions bash > ~/.local/share/bash-completion/completions/delmpc
+  delmpc completions zsh > ~/.zfunc/_delmpc
+  delmpc completions fish > ~/.config/fish/completions/delmpc.fish";
 
 /// Whole-body model-predictive control on a variational integrator.
 ///
@@ -40,17 +71,44 @@ pub struct Cli {
 #[derive(Debug, Subcommand)]
 pub enum Command {
     /// Run a scenario: plant and controller as two processes, watched until they end
+    ///
+    /// The results are left in a folder: the log (log.mcap), the figures (summary.json), the run to look at (report.html), and the
+    /// robot and the effective configuration, with which the run can be run again.
+    #[command(after_long_help = RUN_EXAMPLES)]
     Run(RunArguments),
     /// The plant process alone: simulates the robot, waits for a controller of the same scenario
+    ///
+    /// Whichever process is started first waits for the other one. Both find each other by the scenario, so give both the same
+    /// file and the same --set.
+    #[command(after_long_help = PART_EXAMPLES)]
     Plant(PartArguments),
     /// The controller process alone: waits for a plant of the same scenario
+    ///
+    /// Whichever process is started first waits for the other one. Both find each other by the scenario, so give both the same
+    /// file and the same --set.
+    #[command(after_long_help = PART_EXAMPLES)]
     Controller(PartArguments),
-    /// Check a robot model; print its table or, with --at, everything computed from it
+    /// Check a robot model; print its table, draw it or, with --at, compute everything from it
+    ///
+    /// The table shows the tree with joints, limits and masses, the names of the companion table, and what was accepted but should
+    /// be known.
+    #[command(after_long_help = MODEL_EXAMPLES)]
     Model(ModelArguments),
     /// Find the largest push survived in every direction: table, JSON, polar plot
     PushMap(PushMapArguments),
     /// Run again from the log of a run and compare bit by bit
+    ///
+    /// The plant is given every logged command where it came; each state and truth must come out as logged. In lockstep the
+    /// controller is given every logged state, and each command must come out as logged.
     Replay(ReplayArguments),
+    /// Make report.html and the plots of a run again from its files
+    ///
+    /// The page is one file and needs no network: an animation of the robot, plots with one cursor, the criteria of the scenario.
+    /// The key plots are left as PNG in the folder plots/ beside it. Prints the path of the page.
+    Report(ReportArguments),
+    /// Print the script that makes a shell complete our words
+    #[command(after_long_help = COMPLETIONS_EXAMPLES)]
+    Completions(CompletionsArguments),
 }
 
 /// Options of `delmpc run`.
@@ -68,6 +126,9 @@ pub struct RunOptions {
     /// Print the summary as one JSON object and nothing else
     #[arg(long)]
     pub json: bool,
+    /// Do not write report.html and the plots
+    #[arg(long)]
+    pub no_report: bool,
     /// Both parts in one process: deterministic, for debugging; needs the lockstep clock
     #[arg(long)]
     pub one_process: bool,

@@ -1,6 +1,7 @@
 //! The command `delmpc`: its parts as a library, so that tests can use them without a terminal.
 //!
-//! One file per subcommand ([`run`], [`plant`], [`controller`], [`model`], [`replay`], [`push_map`]); what they share:
+//! One file per subcommand ([`run`], [`plant`], [`controller`], [`model`], [`replay`], [`push_map`],
+//! [`mod@report`]); what they share:
 //!
 //! | file | what it does |
 //! |---|---|
@@ -15,12 +16,18 @@
 //! | [`one_process`] | both loops in one process |
 //! | [`truth`], [`observer`], [`metrics`], [`sole`] | what happened, and the figures made of it |
 //! | [`summary`] | all figures, success, the table a person reads |
-//! | [`log`] | the log of states, commands and truth |
+//! | [`drawing`] | a robot in its postures as SVG |
+//! | [`completions`] | what a shell needs to complete our words |
+//! | [`log`], [`log_viewer`] | the log of states, commands and truth, and what shows the robot to viewers of logs |
+//! | [`mod@report`] | the run to look at: `report.html` and pictures of the key plots |
 //! | [`status_line`] | one line about the running run |
 
 pub mod cli;
+pub mod completions;
 pub mod controller;
+pub mod drawing;
 pub mod log;
+pub mod log_viewer;
 pub mod metrics;
 pub mod model;
 pub mod observer;
@@ -30,6 +37,7 @@ pub mod plant;
 pub mod plant_process;
 pub mod push_map;
 pub mod replay;
+pub mod report;
 pub mod robot_controller;
 pub mod run;
 pub mod run_folder;

@@ -3,9 +3,12 @@
 //! Messages are ROS 2 CDR: the structs as they lie in memory behind a header of four bytes. All their fields are naturally aligned, so the
 //! two forms are the same, bit for bit; the schemas in this file say what the bytes are, and any MCAP tool reads them.
 //!
+//! Beside them, in JSON, what makes viewers show the robot: [`crate::log_viewer`]. Scenario and robot are attached as files.
+//!
 //! The loop only puts records into a bounded queue. A thread of ordinary priority writes them; when it cannot keep up, records are
 //! dropped and counted in real time, and waited for in lockstep.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::BufWriter;
@@ -16,8 +19,9 @@ use std::thread::JoinHandle;
 use bytemuck::bytes_of;
 use delmpc_messages::{Command, PlantState};
 use mcap::records::{MessageHeader, Metadata};
-use mcap::{Compression, WriteOptions, Writer};
+use mcap::{Attachment, Compression, WriteOptions, Writer};
 
+use crate::log_viewer::{self, LogViewer};
 use crate::truth::Truth;
 use crate::verdict::Failure;
 
@@ -32,6 +36,17 @@ pub const STATE: &str = "/plant/state";
 pub const COMMAND: &str = "/controller/command";
 /// What really happened.
 pub const TRUTH: &str = "/plant/truth";
+
+/// What a log begins with.
+#[derive(Debug, Clone, Default)]
+pub struct LogHead {
+    /// Metadata of the run.
+    pub about: BTreeMap<String, String>,
+    /// Files that belong to it: name, media type, content.
+    pub files: Vec<(String, &'static str, Vec<u8>)>,
+    /// What shows the robot to viewers, if anything.
+    pub viewer: Option<LogViewer>,
+}
 
 enum Record {
     State(PlantState),
@@ -48,13 +63,13 @@ pub struct Log {
 }
 
 impl Log {
-    /// Opens the file and starts the writer. `about` becomes the metadata of the run. `waits`: when the queue is full, wait, do not drop.
+    /// Opens the file and starts the writer. `waits`: when the queue is full, wait, do not drop.
     ///
     /// Make it before raising the priority: the writer is an ordinary thread.
     ///
     /// # Errors
     /// When the file cannot be made.
-    pub fn create(path: &Path, about: BTreeMap<String, String>, waits: bool) -> Result<Self, Failure> {
+    pub fn create(path: &Path, head: LogHead, waits: bool) -> Result<Self, Failure> {
         let cannot = |error: &dyn std::fmt::Display| Failure::Fault(format!("{}: {error}", path.display()));
         let file = File::create(path).map_err(|error| cannot(&error))?;
         let mut writer = WriteOptions::new()
@@ -63,11 +78,18 @@ impl Log {
             .library("delmpc")
             .create(BufWriter::new(file))
             .map_err(|error| cannot(&error))?;
-        let channels = Channels::add(&mut writer).map_err(|error| cannot(&error))?;
-        let metadata = Metadata { name: "run".to_owned(), metadata: about };
+        let metadata = Metadata { name: "run".to_owned(), metadata: head.about };
         writer.write_metadata(&metadata).map_err(|error| cannot(&error))?;
+        for (name, media_type, content) in head.files {
+            // Without a date: logs of lockstep runs are the same bytes.
+            let (media_type, data) = (media_type.to_owned(), Cow::from(content));
+            let file = Attachment { log_time: 0, create_time: 0, name, media_type, data };
+            writer.attach(&file).map_err(|error| cannot(&error))?;
+        }
+        let viewer = head.viewer;
+        let channels = Channels::add(&mut writer, viewer.is_some()).map_err(|error| cannot(&error))?;
         let (queue, records) = sync_channel(QUEUE);
-        let writer = std::thread::spawn(move || write_all(writer, channels, &records));
+        let writer = std::thread::spawn(move || write_all(writer, channels, viewer, &records));
         Ok(Self { queue: Some(queue), writer: Some(writer), waits, dropped: 0 })
     }
 
@@ -123,10 +145,24 @@ struct Channels {
     state: u16,
     command: u16,
     truth: u16,
+    viewer: BTreeMap<&'static str, u16>,
 }
 
 impl Channels {
-    fn add(writer: &mut Writer<BufWriter<File>>) -> Result<Self, mcap::McapError> {
+    fn add(writer: &mut Writer<BufWriter<File>>, with_viewer: bool) -> Result<Self, mcap::McapError> {
+        let mut viewer = BTreeMap::new();
+        if with_viewer {
+            let (transforms, scene) = (log_viewer::transforms_schema(), log_viewer::scene_schema());
+            for (topic, schema) in [
+                (log_viewer::TRANSFORMS, &transforms),
+                (log_viewer::ROBOT, &scene),
+                (log_viewer::FORCES, &scene),
+            ] {
+                let name = schema["title"].as_str().unwrap_or_default();
+                let schema = writer.add_schema(name, "jsonschema", schema.to_string().as_bytes())?;
+                viewer.insert(topic, writer.add_channel(schema, topic, "json", &BTreeMap::new())?);
+            }
+        }
         let mut add = |topic: &str, name: &str, schema: &str| {
             let schema = writer.add_schema(name, "ros2msg", schema.as_bytes())?;
             writer.add_channel(schema, topic, "cdr", &BTreeMap::new())
@@ -135,6 +171,7 @@ impl Channels {
             state: add(STATE, "delmpc_msgs/msg/PlantState", &plant_state_schema())?,
             command: add(COMMAND, "delmpc_msgs/msg/Command", &command_schema())?,
             truth: add(TRUTH, "delmpc_msgs/msg/Truth", TRUTH_FIELDS)?,
+            viewer,
         })
     }
 }
@@ -142,9 +179,17 @@ impl Channels {
 fn write_all(
     mut writer: Writer<BufWriter<File>>,
     channels: Channels,
+    mut viewer: Option<LogViewer>,
     records: &Receiver<(u64, Record)>,
 ) -> Result<(), mcap::McapError> {
     let mut sequences = BTreeMap::<u16, u32>::new();
+    let mut write = |channel_id: u16, time_ns: u64, bytes: &[u8]| {
+        let sequence = sequences.entry(channel_id).or_default();
+        let header =
+            MessageHeader { channel_id, sequence: *sequence, log_time: time_ns, publish_time: time_ns };
+        *sequence += 1;
+        writer.write_to_known_channel(&header, bytes)
+    };
     let mut bytes = Vec::new();
     for (time_ns, record) in records {
         let (channel_id, content) = match &record {
@@ -155,11 +200,14 @@ fn write_all(
         bytes.clear();
         bytes.extend_from_slice(&ENCAPSULATION);
         bytes.extend_from_slice(content);
-        let sequence = sequences.entry(channel_id).or_default();
-        let header =
-            MessageHeader { channel_id, sequence: *sequence, log_time: time_ns, publish_time: time_ns };
-        *sequence += 1;
-        writer.write_to_known_channel(&header, &bytes)?;
+        write(channel_id, time_ns, &bytes)?;
+        if let (Some(viewer), Record::Truth(truth)) = (&mut viewer, &record) {
+            for (topic, message) in viewer.messages(truth) {
+                if let Some(&channel_id) = channels.viewer.get(topic) {
+                    write(channel_id, time_ns, message.to_string().as_bytes())?;
+                }
+            }
+        }
     }
     writer.finish()?;
     Ok(())
@@ -418,7 +466,12 @@ mod tests {
         let folder = std::env::temp_dir();
         let write = |name: &str| {
             let path = folder.join(format!("delmpc-log-{name}-{}.mcap", std::process::id()));
-            let mut log = Log::create(&path, BTreeMap::from([("seed".into(), "1".into())]), true).unwrap();
+            let mut log = Log::create(
+                &path,
+                LogHead { about: [("seed".into(), "1".into())].into(), ..LogHead::default() },
+                true,
+            )
+            .unwrap();
             for k in 0..3000 {
                 let mut truth = Truth::new(3);
                 truth.time_ns = k * 1_000_000;

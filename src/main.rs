@@ -22,6 +22,8 @@ fn main() -> ExitCode {
         Command::Model(arguments) => delmpc::model::model(&arguments),
         Command::PushMap(arguments) => delmpc::push_map::push_map(&arguments),
         Command::Replay(arguments) => delmpc::replay::replay(&arguments),
+        Command::Completions(arguments) => delmpc::completions::completions(&arguments),
+        Command::Report(arguments) => delmpc::report::report(&arguments),
     })
 }
 

@@ -17,6 +17,7 @@ use delmpc_robots::{BaseChoice, ImpossibleInertia, LoadOptions, RobotModel, load
 use nalgebra::{DMatrix, DVector, Quaternion, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
+use crate::drawing::drawing;
 use crate::verdict::{Ended, Failure};
 
 /// Arguments of `delmpc model`.
@@ -33,6 +34,9 @@ pub struct ModelArguments {
     /// Take inertias that break the triangle inequality as they are, with a warning
     #[arg(long)]
     pub accept_impossible_inertia: bool,
+    /// Draw the robot in its postures
+    #[arg(long, value_name = "FILE.svg", conflicts_with = "at")]
+    pub svg: Option<PathBuf>,
 }
 
 /// Runs the command.
@@ -49,7 +53,15 @@ pub fn model(arguments: &ModelArguments) -> Result<Ended, Failure> {
                 .map_err(|error| Failure::Input(format!("{}: {error}", file.display())))?;
             println!("{}", serde_json::to_string(&answer).map_err(Failure::fault)?);
         }
-        None => print!("{}", table(&load_robot(arguments, arguments.base.as_deref(), None)?)),
+        None => {
+            let robot = load_robot(arguments, arguments.base.as_deref(), None)?;
+            print!("{}", table(&robot));
+            if let Some(file) = &arguments.svg {
+                let svg = drawing(&robot).map_err(Failure::input)?;
+                std::fs::write(file, svg)
+                    .map_err(|error| Failure::Input(format!("--svg {}: {error}", file.display())))?;
+            }
+        }
     }
     Ok(Ended::Well)
 }
@@ -389,7 +401,7 @@ fn rows(matrix: &DMatrix<f64>) -> Vec<Vec<f64>> {
     matrix.row_iter().map(|row| row.iter().copied().collect()).collect()
 }
 
-/// A model as a person reads it.
+/// A model as a person reads it: the tree with its joints, limits and masses, then names, then warnings.
 fn table(robot: &RobotModel) -> String {
     let tree = &robot.tree;
     let mut text = String::new();
@@ -398,50 +410,98 @@ fn table(robot: &RobotModel) -> String {
     let _ = writeln!(text, "{}: {base}, {joints} joints, {bodies} bodies, {mass:.4} kg", robot.name);
     let mut kinematics = Kinematics::new(tree);
     let zeros = vec![0.0; joints];
-    if kinematics.update_positions(tree, &Configuration::floating(RigidTransform::identity(), &zeros)).is_ok()
-    {
+    let at_zero = match tree.is_floating() {
+        true => Configuration::floating(RigidTransform::identity(), &zeros),
+        false => Configuration::fixed(&zeros),
+    };
+    if kinematics.update_positions(tree, &at_zero).is_ok() {
         let com = kinematics.mass_centre_of_tree_w(tree);
-        let _ = writeln!(
-            text,
-            "mass centre at zero, base body at the origin: {:.4} {:.4} {:.4} m",
-            com.x, com.y, com.z
-        );
+        let zero =
+            if tree.is_floating() { "joints at zero, base body at the origin" } else { "joints at zero" };
+        let _ = writeln!(text, "mass centre with {zero}: {:.4} {:.4} {:.4} m", com.x, com.y, com.z);
     }
-    let widest = robot.body_names.iter().chain(&robot.joint_names).map(String::len).max().unwrap_or(0).max(6);
-    let _ = writeln!(
-        text,
-        "\n{:widest$}  {:widest$}  {:9}  {:>9}  {:>9}  {:>9}  {:>9}  {:>9}",
-        "joint", "body", "kind", "mass kg", "lower", "upper", "effort", "speed"
-    );
-    for (index, body) in tree.bodies().iter().enumerate() {
-        let first = tree.first_joint_body();
-        let mass = body.inertia.mass;
-        let name = &robot.body_names[index];
-        if index < first {
-            let _ = writeln!(text, "{:widest$}  {name:widest$}  {:9}  {mass:9.4}", "-", "base");
+
+    let branches = branches(tree);
+    let names: Vec<String> =
+        branches.iter().zip(&robot.body_names).map(|(branch, name)| format!("{branch}{name}")).collect();
+    let width = |names: &[String], least: usize| {
+        names.iter().map(|name| name.chars().count()).max().unwrap_or(0).max(least)
+    };
+    let (body_width, joint_width) = (width(&names, 4), width(&robot.joint_names, 5));
+    let mut row = |[body, joint, kind, mass, range, effort, speed, damping]: [&str; 8]| {
+        let line = format!(
+            "{body:body_width$}  {joint:joint_width$}  {kind:9}  {mass:>9}  {range:>20}  {effort:>9}  {speed:>9}  {damping:>8}"
+        );
+        let _ = writeln!(text, "{}", line.trim_end());
+    };
+    row([""; 8]);
+    row(["body", "joint", "kind", "mass", "position", "effort", "speed", "damping"]);
+    row(["", "", "", "kg", "rad or m", "N m or N", "per s", "per s"]);
+    let first = tree.first_joint_body();
+    for (index, (body, name)) in tree.bodies().iter().zip(&names).enumerate() {
+        let mass = format!("{:.4}", body.inertia.mass);
+        let Some(joint) = index.checked_sub(first) else {
+            row([name, "", "floating", &mass, "", "", "", ""]);
             continue;
-        }
-        let joint = index - first;
-        let limit = &robot.limits[joint];
-        let kind = match body.joint.kind {
-            JointKind::Revolute => "revolute",
-            JointKind::Prismatic => "prismatic",
         };
-        let _ = writeln!(
-            text,
-            "{:widest$}  {name:widest$}  {kind:9}  {mass:9.4}  {:9.4}  {:9.4}  {:9.2}  {:9.2}",
-            robot.joint_names[joint], limit.lower, limit.upper, limit.effort, limit.velocity
-        );
+        let limit = &robot.limits[joint];
+        let kind = match (robot.actuated[joint], body.joint.kind) {
+            (true, JointKind::Revolute) => "revolute",
+            (true, JointKind::Prismatic) => "prismatic",
+            (false, _) => "passive",
+        };
+        let range = match limit.lower.is_finite() || limit.upper.is_finite() {
+            true => format!("{:.4} .. {:7.4}", limit.lower, limit.upper),
+            false => "free".to_owned(),
+        };
+        let bound = |value: f64| if value.is_finite() { format!("{value:.2}") } else { "-".to_owned() };
+        let (effort, speed) = (bound(limit.effort), bound(limit.velocity));
+        row([
+            name,
+            &robot.joint_names[joint],
+            kind,
+            &mass,
+            &range,
+            &effort,
+            &speed,
+            &bound(robot.damping[joint]),
+        ]);
     }
-    let names = |list: Vec<&str>| if list.is_empty() { "none".to_owned() } else { list.join(", ") };
+    let list = |names: Vec<&str>| if names.is_empty() { "none".to_owned() } else { names.join(", ") };
     let soles: Vec<&str> = robot.soles.iter().map(|sole| sole.name.as_str()).collect();
     let postures: Vec<&str> = robot.postures.iter().map(|posture| posture.name.as_str()).collect();
     let frames: Vec<&str> = robot.frames.iter().map(|frame| frame.name.as_str()).collect();
-    let _ =
-        writeln!(text, "\nsoles: {}\nframes: {}\npostures: {}", names(soles), names(frames), names(postures));
-    let _ = writeln!(text, "contact points: {}", robot.contacts.len());
+    let contacts: Vec<&str> = robot.contacts.iter().map(|contact| contact.name.as_str()).collect();
+    let _ = writeln!(text, "\nsoles:           {}\nframes:          {}", list(soles), list(frames));
+    let _ = writeln!(text, "contact points:  {}\npostures:        {}", list(contacts), list(postures));
+    if robot.warnings.is_empty() {
+        let _ = writeln!(text, "no warnings");
+    }
     for warning in &robot.warnings {
         let _ = writeln!(text, "warning: {warning}");
     }
     text
+}
+
+/// What stands before the name of each body to draw the tree.
+fn branches(tree: &KinematicTree) -> Vec<String> {
+    let bodies = tree.bodies();
+    let is_last =
+        |index: usize| !bodies.iter().skip(index + 1).any(|other| other.parent == bodies[index].parent);
+    let mark = |index: usize, own: bool| match (own, is_last(index)) {
+        (true, true) => "└ ",
+        (true, false) => "├ ",
+        (false, true) => "  ",
+        (false, false) => "│ ",
+    };
+    let branch = |index: usize| {
+        let mut marks = Vec::new();
+        let mut at = index;
+        while let Some(parent) = bodies[at].parent {
+            marks.push(mark(at, at == index));
+            at = parent;
+        }
+        marks.into_iter().rev().collect()
+    };
+    (0..bodies.len()).map(branch).collect()
 }

@@ -12,7 +12,7 @@ use delmpc_transport::{LinkError, Publisher, RunId, Subscriber, in_process_link}
 use crate::controller::part;
 use crate::log::Log;
 use crate::part::{leave_part, message_run_id};
-use crate::plant::about;
+use crate::plant::log_head;
 use crate::plant_process::PlantLoop;
 use crate::robot_controller::RobotController;
 use crate::run_folder::{CONTROLLER_PART, PLANT_PART, RunFolder};
@@ -27,7 +27,7 @@ use crate::verdict::Failure;
 /// # Errors
 /// [`Failure::Input`] when a part cannot be made of the scenario, [`Failure::Fault`] when the log cannot be written.
 pub fn run_in_one_process(setup: &Setup, folder: &RunFolder, stop: &StopFlag) -> Result<Course, Failure> {
-    let log = Log::create(&folder.file("log.mcap"), about(setup, RunId(0)), true)?;
+    let log = Log::create(&folder.file("log.mcap"), log_head(setup, RunId(0)), true)?;
     match simulate(setup, log, stop)? {
         Simulated::Fault(why) => Ok(Course::Fault(why)),
         Simulated::Ended { plant, figures } => {

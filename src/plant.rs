@@ -4,11 +4,12 @@ use std::collections::BTreeMap;
 
 use delmpc_controller_process::membership::Membership;
 use delmpc_messages::{PlantState, Role};
-use delmpc_scenario::Clock;
+use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::{Channel, RunId};
 
 use crate::cli::PartArguments;
-use crate::log::Log;
+use crate::log::{Log, LogHead};
+use crate::log_viewer::LogViewer;
 use crate::part::{Supervisor, ended, leave_part, message_run_id, prepare_machine, run_id, say};
 use crate::plant_process::PlantLoop;
 use crate::run_folder::{PLANT_PART, ROBOT_FILE};
@@ -28,7 +29,7 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
     let mut robot = SimulatedRobot::new(&setup)?;
     let log = match &arguments.out {
         Some(folder) => {
-            Log::create(&folder.join("log.mcap"), about(&setup, run), scenario.clock == Clock::Lockstep)?
+            Log::create(&folder.join("log.mcap"), log_head(&setup, run), scenario.clock == Clock::Lockstep)?
         }
         None => Log::none(),
     };
@@ -55,9 +56,24 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
 }
 
 /// What the log says about its run. In lockstep only what is the same in every run of the seed.
-pub fn about(setup: &Setup, run: RunId) -> BTreeMap<String, String> {
+pub fn log_head(setup: &Setup, run: RunId) -> LogHead {
+    let mut files = setup.robot_files();
+    files.insert(
+        0,
+        ("scenario.toml".to_owned(), "application/toml", effective_scenario(setup).to_toml().into_bytes()),
+    );
+    LogHead { about: about(setup, run), files, viewer: Some(LogViewer::new(setup)) }
+}
+
+/// The scenario as it is in the run's folder.
+fn effective_scenario(setup: &Setup) -> Scenario {
     let mut scenario = setup.scenario.clone();
     scenario.robot.urdf = ROBOT_FILE.to_owned();
+    scenario
+}
+
+fn about(setup: &Setup, run: RunId) -> BTreeMap<String, String> {
+    let scenario = effective_scenario(setup);
     let mut about = BTreeMap::from([
         ("program".to_owned(), concat!("delmpc ", env!("CARGO_PKG_VERSION")).to_owned()),
         ("scenario".to_owned(), scenario.name.clone()),
@@ -65,6 +81,8 @@ pub fn about(setup: &Setup, run: RunId) -> BTreeMap<String, String> {
         ("configuration".to_owned(), scenario.to_toml()),
         ("joints".to_owned(), setup.robot.joint_names.join(" ")),
         ("joint_set_hash".to_owned(), format!("{:016x}", setup.joint_set_hash())),
+        ("model_hash".to_owned(), format!("{:016x}", setup.model_hash())),
+        ("git_revision".to_owned(), env!("DELMPC_GIT_REVISION").to_owned()),
     ]);
     if scenario.clock == Clock::Realtime {
         about.insert("run".to_owned(), run.to_string());

@@ -64,6 +64,12 @@ pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
     let summary = Summary::new(scenario, plant, controller, fault);
     let written = summary.write(&folder.file("summary.json"));
     written.map_err(|error| Failure::Fault(format!("summary.json: {error}")))?;
+    if !options.no_report {
+        // A run is not worse because it cannot be drawn.
+        if let (Err(failure), false) = (crate::report::write(folder.path()), options.quiet) {
+            eprintln!("warning: no report: {failure}");
+        }
+    }
 
     if options.json {
         println!("{}", summary.to_json());

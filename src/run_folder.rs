@@ -7,6 +7,7 @@
 //! | `summary.json` | the figures of the run |
 //! | `log.mcap` | what was measured, commanded and true |
 //! | `messages.txt` | what the processes said |
+//! | `report.html`, `plots/` | the run to look at, and its key plots as PNG |
 
 use std::fs;
 use std::io::ErrorKind;
@@ -20,9 +21,14 @@ use crate::setup::Setup;
 use crate::verdict::Failure;
 
 /// Files of an earlier run that would be taken for results of this one.
-const RESULTS: [&str; 5] = ["summary.json", "log.mcap", "messages.txt", PLANT_PART, CONTROLLER_PART];
+const RESULTS: [&str; 6] =
+    ["summary.json", "log.mcap", "messages.txt", REPORT_FILE, PLANT_PART, CONTROLLER_PART];
 /// The robot.
 pub const ROBOT_FILE: &str = "robot.urdf";
+/// The run to look at.
+pub const REPORT_FILE: &str = "report.html";
+/// Folder of the report's key plots as pictures.
+pub const PLOTS_FOLDER: &str = "plots";
 /// What the plant process found out; part of the summary.
 pub const PLANT_PART: &str = "plant.json";
 /// What the controller process found out; part of the summary.

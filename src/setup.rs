@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use delmpc_messages::{MAX_JOINTS, joint_set_hash};
+use delmpc_messages::{JointSetHasher, MAX_JOINTS, joint_set_hash};
 use delmpc_robots::{RobotModel, load};
 use delmpc_scenario::{Document, Scenario};
 
@@ -44,6 +44,28 @@ impl Setup {
     pub fn joint_set_hash(&self) -> u64 {
         let names: Vec<&str> = self.robot.joint_names.iter().map(String::as_str).collect();
         joint_set_hash(&names)
+    }
+
+    /// The files the robot came from, as they are now: name in the run's folder, media type, content.
+    pub fn robot_files(&self) -> Vec<(String, &'static str, Vec<u8>)> {
+        let companion = self.urdf.with_extension("toml");
+        let files = [
+            (self.urdf.as_path(), "robot.urdf", "application/xml"),
+            (&companion, "robot.toml", "application/toml"),
+        ];
+        let content = |(path, name, kind): (&Path, &str, &'static str)| {
+            std::fs::read(path).ok().map(|content| (name.to_owned(), kind, content))
+        };
+        files.into_iter().filter_map(content).collect()
+    }
+
+    /// A number that stands for the robot's files, every byte of them: FNV-1a, as for joint sets.
+    pub fn model_hash(&self) -> u64 {
+        let texts = self
+            .robot_files()
+            .into_iter()
+            .map(|(.., content)| String::from_utf8_lossy(&content).into_owned());
+        texts.fold(JointSetHasher::new(), |hash, text| hash.joint(&text)).finish()
     }
 
     /// The frame of the sole the robot stands on.
