@@ -26,6 +26,7 @@ use crate::dual_qp::QpSolver;
 use crate::errors::ControlError;
 use crate::estimator::{Estimate, Estimator};
 use crate::fallback::{Attempt, FallbackLadder, Situation};
+use crate::horizon_dynamics::HorizonDynamics;
 use crate::kernels::{all_finite, gemv};
 use crate::lq_problem::{LqProblem, LqSize, LqStage};
 use crate::model::ControllerModel;
@@ -125,9 +126,9 @@ pub struct Controller {
     cone: Option<WrenchCone>,
 
     dynamics: StageDynamics,
+    horizon: HorizonDynamics,
     nodes: Vec<NodeKinematics>,
     gravity: InverseDynamicsWorkspace,
-    gravity_torque: Vec<f64>,
     wrench: StageWrench,
 
     problem: LqProblem,
@@ -219,9 +220,9 @@ impl Controller {
             torque_weight,
             cone,
             dynamics: StageDynamics::new(tree)?,
+            horizon: HorizonDynamics::new(tree, lengths.len())?,
             nodes: vec![NodeKinematics::new(tree); lengths.len() + 1],
             gravity: InverseDynamicsWorkspace::new(tree),
-            gravity_torque: vec![0.0; n],
             wrench: StageWrench::new(n),
             problem,
             riccati: Riccati::new(size),
@@ -412,27 +413,25 @@ impl Controller {
         let tree = &self.model.tree;
         let n = tree.dof();
         let stages = self.lengths.len();
+        let Trajectory { x: nodes, u: inputs } = &self.nominal.values;
+        self.horizon
+            .linearise(nodes.as_ref(), inputs.as_ref(), &self.lengths, &mut self.problem.stages)
+            .map_err(|_| reason::STAGE)?;
         for (k, node) in self.nodes.iter_mut().enumerate() {
-            let (q, q_dot) = self.nominal.values.x.col_as_slice(k).split_at(n);
-            node.update(tree, q, q_dot).map_err(|_| reason::STAGE)?;
+            node.take(self.horizon.batch(), k);
         }
         for k in 0..stages {
-            let (x, u) = (self.nominal.values.x.col_as_slice(k), self.nominal.values.u.col_as_slice(k));
-            let next = self.nominal.values.x.col_as_slice(k + 1);
+            let (x, u) = (nodes.col_as_slice(k), inputs.col_as_slice(k));
             let stage = &mut self.problem.stages[k];
             let duration = self.lengths[k];
-            self.dynamics.linearise(tree, x, u, duration, next, stage).map_err(|_| reason::STAGE)?;
 
             self.reference.sample(self.nominal.start_s + self.nominal.offsets()[k], &mut self.targets);
-            let kinematics = self.nodes[k].kinematics();
-            gravity_force_into(tree, kinematics, &mut self.gravity, &mut self.gravity_torque)
-                .map_err(|_| reason::STAGE)?;
             stage.hessian.fill(0.0);
             stage.gradient.fill(0.0);
-            for (j, (u, carried)) in u.iter().zip(&self.gravity_torque).enumerate() {
+            for (j, u) in u.iter().enumerate() {
                 let weight = self.torque_weight[j] * duration;
                 stage.hessian[(j, j)] = weight;
-                stage.gradient[j] = weight * (u - carried);
+                stage.gradient[j] = weight * (u - self.horizon.batch().gravity_force(k, j));
             }
             let hessian = stage.hessian.as_mut().submatrix_mut(n, n, 2 * n, 2 * n);
             let gradient = &mut stage.gradient[n..];

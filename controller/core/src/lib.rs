@@ -32,6 +32,7 @@ pub mod dual_qp;
 pub mod errors;
 pub mod estimator;
 pub mod fallback;
+pub mod horizon_dynamics;
 pub(crate) mod kernels;
 pub mod lq_problem;
 pub mod model;

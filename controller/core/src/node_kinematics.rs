@@ -8,6 +8,9 @@
 //! (I3), (I4) of the mechanics handbook summed over the subtree: with `η = S_j` and `ν = Ṡ_j` for every body beyond j,
 //! `δ(M v) = M ν - ad^D_{M v} η`. Mass centre: `m ċ` is the linear part of `P`, so `∂c/∂q = ∂ċ/∂q̇` is that of `𝓜_j S_j / m`.
 //!
+//! A node is evaluated by itself ([`NodeKinematics::update`]) or taken from a stage-parallel linearisation, which has all of this at
+//! hand ([`NodeKinematics::take`]).
+//!
 //! Cost: O(n), no allocation after [`NodeKinematics::new`]. Fixed base.
 //!
 //! Source: R. Featherstone, *Rigid Body Dynamics Algorithms*, 2008, section 2.13 for composite momenta; own derivation.
@@ -17,7 +20,8 @@ use alloc::vec::Vec;
 
 use delmpc_mechanics::errors::ModelError;
 use delmpc_mechanics::kinematics::{Configuration, Kinematics, Velocity};
-use delmpc_mechanics::spatial::{Momentum, SpatialInertia, Twist};
+use delmpc_mechanics::spatial::{Momentum, RigidTransform, SpatialInertia, Twist};
+use delmpc_mechanics::stage_batch::StageBatch;
 use delmpc_mechanics::tree::KinematicTree;
 use nalgebra::Vector3;
 
@@ -25,6 +29,9 @@ use nalgebra::Vector3;
 #[derive(Clone, Debug)]
 pub struct NodeKinematics {
     kinematics: Kinematics,
+    link_pose_w: Vec<RigidTransform>,
+    joint_twist_w: Vec<Twist>,
+    velocity_w: Vec<Twist>,
     composite: Vec<SpatialInertia>,
     subtree_momentum: Vec<Momentum>,
     d_momentum_d_rate: Vec<Momentum>,
@@ -40,6 +47,9 @@ impl NodeKinematics {
         let n = tree.body_count();
         Self {
             kinematics: Kinematics::new(tree),
+            link_pose_w: vec![RigidTransform::identity(); n],
+            joint_twist_w: vec![Twist::default(); n],
+            velocity_w: vec![Twist::default(); n],
             composite: vec![SpatialInertia::default(); n],
             subtree_momentum: vec![Momentum::default(); n],
             d_momentum_d_rate: vec![Momentum::default(); n],
@@ -77,12 +87,38 @@ impl NodeKinematics {
             self.d_momentum_d_q[i] = inertia.mul_twist(&twist_rate) - momentum.dual_bracket(&twist);
         }
         self.com = self.kinematics.mass_centre_of_tree_w(tree);
+        self.link_pose_w.copy_from_slice(self.kinematics.link_poses_w());
+        self.joint_twist_w.copy_from_slice(self.kinematics.joint_twists_w());
+        self.velocity_w.copy_from_slice(self.kinematics.velocities_w());
         Ok(())
     }
 
-    /// Poses and twists of all bodies.
+    /// Takes over the start node of a linearised stage; the node behind the last stage is that of stage `batch.stages()`.
+    pub fn take(&mut self, batch: &StageBatch, stage: usize) {
+        for i in 0..self.link_pose_w.len() {
+            self.link_pose_w[i] = batch.link_pose_w(stage, i);
+            self.joint_twist_w[i] = batch.joint_twist_w(stage, i);
+            self.velocity_w[i] = batch.velocity_w(stage, i);
+            self.d_momentum_d_rate[i] = batch.d_momentum_d_rate(stage, i);
+            self.d_momentum_d_q[i] = batch.d_momentum_d_q(stage, i);
+        }
+        self.momentum = batch.momentum_w(stage);
+        self.com = batch.com_w(stage);
+    }
+
+    /// Kinematics of the last [`NodeKinematics::update`].
     pub fn kinematics(&self) -> &Kinematics {
         &self.kinematics
+    }
+
+    /// Pose of a body's link frame in {0}.
+    pub fn link_pose_w(&self, body: usize) -> &RigidTransform {
+        &self.link_pose_w[body]
+    }
+
+    /// Joint twist `S_j` in {0}.
+    pub fn joint_twist_w(&self, joint: usize) -> &Twist {
+        &self.joint_twist_w[joint]
     }
 
     /// Total momentum about the origin of {0}.
@@ -122,7 +158,9 @@ impl NodeKinematics {
 
     /// Position in {0} and velocity of a point of a body (link frame).
     pub fn point(&self, body: usize, point: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
-        (self.kinematics.point_w(body, point), self.kinematics.point_velocity_w(body, point))
+        let (pose, twist) = (&self.link_pose_w[body], &self.velocity_w[body]);
+        let position = pose.rotation * point + pose.translation;
+        (position, twist.linear + twist.angular.cross(&position))
     }
 
     /// Derivatives of a point's position and velocity by `q_j`, for `j` on the branch of the point's body. The derivative of the
@@ -135,10 +173,10 @@ impl NodeKinematics {
         point_w: &Vector3<f64>,
         joint: usize,
     ) -> (Vector3<f64>, Vector3<f64>) {
-        let twist = self.kinematics.joint_twists_w()[joint];
-        let velocity = self.kinematics.velocities_w()[body];
+        let twist = self.joint_twist_w[joint];
+        let velocity = self.velocity_w[body];
         let moved = twist.linear + twist.angular.cross(point_w);
-        let relative: Twist = self.kinematics.velocities_w()[joint] - velocity;
+        let relative: Twist = self.velocity_w[joint] - velocity;
         let change = relative.bracket(&twist);
         let rate = change.linear + change.angular.cross(point_w) + velocity.angular.cross(&moved);
         (moved, rate)

@@ -39,9 +39,7 @@ pub fn posture_goal(model: &ControllerModel, q: &[f64]) -> Result<PostureGoal, M
     let point = |p: Option<crate::model::BodyPoint>| {
         p.map_or_else(Vector3::zeros, |p| node.point(p.body, &p.position).0)
     };
-    let rotation = model
-        .swing_foot
-        .map_or_else(Matrix3::identity, |p| node.kinematics().link_poses_w()[p.body].rotation);
+    let rotation = model.swing_foot.map_or_else(Matrix3::identity, |p| node.link_pose_w(p.body).rotation);
     Ok(PostureGoal {
         q: q.to_vec(),
         com: node.com(),

@@ -233,10 +233,9 @@ impl Tasks {
             let weight = swing_foot.map(|w| w * duration);
             self.push(weight, &(position - targets.swing_foot), d_position, branch());
             // R = exp(r^) R_ref: to first order in r its derivative is the spatial angular velocity.
-            let rotation = node.kinematics().link_poses_w()[point.body].rotation;
+            let rotation = node.link_pose_w(point.body).rotation;
             let residual = log_rotation(&(rotation * targets.swing_foot_rotation.transpose()));
-            let d_rotation =
-                |j: usize| Some((node.kinematics().joint_twists_w()[j].angular, Vector3::zeros()));
+            let d_rotation = |j: usize| Some((node.joint_twist_w(j).angular, Vector3::zeros()));
             self.push([swing_foot_rotation * duration; 3], &residual, d_rotation, branch());
         }
     }
