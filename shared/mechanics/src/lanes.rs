@@ -3,9 +3,15 @@
 //! The recursions of the paper do the same arithmetic at every node `α = 0..s`. Here one lane is one node: a quantity of
 //! a body is stored as a [`Quad`] of four doubles (nodes 0..3; a rule with more nodes uses several quads, its *groups*),
 //! and the kernels are written once over a [`Simd`] token. The processor is asked once, when a workspace is built
-//! ([`Instructions::detect`]); a plain build still uses AVX2 and fused multiply-add where they exist.
+//! ([`Instructions::detect`]); a plain build still uses AVX2 and fused multiply-add, and AVX-512 where it pays.
+//!
+//! Every kernel is compiled once per instruction set, and scalar code for four lanes takes the compiler longer than all
+//! vector code together. On x86-64 it is therefore an option: without the feature `portable`, processors older than AVX2
+//! (2013) are refused by [`ModelError::Processor`]. Other architectures always have it.
 
 use core::ops::{Add, Mul, Neg, Sub};
+
+use crate::errors::ModelError;
 
 /// Lanes in a [`Quad`].
 pub(crate) const LANES: usize = 4;
@@ -78,14 +84,17 @@ macro_rules! wide_as_two_lanes {
 }
 
 /// Plain arrays: what every processor can do.
+#[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Portable;
 
+#[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
 #[inline(always)]
 fn zip(a: [f64; 4], b: [f64; 4], f: impl Fn(f64, f64) -> f64) -> [f64; 4] {
     [f(a[0], b[0]), f(a[1], b[1]), f(a[2], b[2]), f(a[3], b[3])]
 }
 
+#[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
 impl Simd for Portable {
     const SPECIALISE: bool = false;
     wide_as_two_lanes!();
@@ -234,6 +243,7 @@ pub(crate) trait Kernel {
 /// The instruction set the kernels use, found out once.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Instructions {
+    #[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
     Portable,
     #[cfg(target_arch = "x86_64")]
     V3(pulp::x86::V3),
@@ -243,22 +253,29 @@ pub(crate) enum Instructions {
 
 impl Instructions {
     /// The best the processor offers.
-    pub fn detect() -> Self {
+    ///
+    /// # Errors
+    /// [`ModelError::Processor`] on x86-64 without AVX2 and fused multiply-add, unless built with the feature `portable`.
+    pub fn detect() -> Result<Self, ModelError> {
         #[cfg(target_arch = "x86_64")]
         if let Some(v3) = pulp::x86::V3::try_new() {
-            return match pulp::x86::V4::try_new() {
+            return Ok(match pulp::x86::V4::try_new() {
                 Some(v4) => Self::V4(v3, v4),
                 None => Self::V3(v3),
-            };
+            });
         }
-        Self::Portable
+        #[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
+        return Ok(Self::Portable);
+        #[cfg(not(any(not(target_arch = "x86_64"), feature = "portable")))]
+        Err(ModelError::Processor)
     }
 
     /// Runs a kernel with these instructions enabled.
     #[inline(always)]
     pub fn dispatch<K: Kernel>(self, kernel: K) -> K::Output {
         match self {
-            Self::Portable => kernel.run(Portable),
+            #[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
+            Self::Portable => run_portably(kernel),
             #[cfg(target_arch = "x86_64")]
             Self::V3(v3) | Self::V4(v3, _) => pulp::Simd::vectorize(v3, With { kernel, simd: v3 }),
         }
@@ -273,6 +290,13 @@ impl Instructions {
             other => other.dispatch(kernel),
         }
     }
+}
+
+/// Out of line, so that a kernel is compiled once however often it is dispatched.
+#[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
+#[inline(never)]
+fn run_portably<K: Kernel>(kernel: K) -> K::Output {
+    kernel.run(Portable)
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -563,8 +587,9 @@ mod tests {
     #[test]
     fn every_instruction_set_gives_the_same_lanes() {
         let quads = [Quad([1.0, 2.0, -3.0, 0.5]), Quad([4.0, 0.25, 2.0, 8.0])];
-        let expected = Instructions::Portable.dispatch(Sum(&quads));
-        assert_eq!(expected, Instructions::detect().dispatch(Sum(&quads)));
-        assert_eq!(expected[0].0, [3.0, -1.5, -3.0, 3.5]);
+        let best = Instructions::detect().unwrap().dispatch(Sum(&quads));
+        assert_eq!(best[0].0, [3.0, -1.5, -3.0, 3.5]);
+        #[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
+        assert_eq!(best, Instructions::Portable.dispatch(Sum(&quads)));
     }
 }
