@@ -397,6 +397,14 @@ impl<S: Simd> WideLane<S> {
     pub fn splat(simd: S, x: f64) -> Self {
         Self { simd, wide: simd.wide_splat(x) }
     }
+    #[inline(always)]
+    pub fn of(simd: S, quads: &[Quad; 2]) -> Self {
+        Self { simd, wide: simd.wide_load(quads) }
+    }
+    #[inline(always)]
+    pub fn quads(self) -> [Quad; 2] {
+        self.simd.wide_store(self.wide)
+    }
     /// The two quads of `row` from `at` on; zero when the row is too short (which the callers rule out).
     #[inline(always)]
     pub fn load(simd: S, row: &[Quad], at: usize) -> Self {
