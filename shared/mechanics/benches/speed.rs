@@ -156,13 +156,16 @@ fn report(name: &str, tree: &KinematicTree, s: usize, dt: f64, q: &[f64], torque
     }
 }
 
+/// `-- atlas`, `-- 64`: only that robot, only that chain.
 fn main() {
+    let only: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with("--")).collect();
+    let wanted = |name: &str| only.is_empty() || only.iter().any(|o| o == name);
     let case = oracle::Case::new("atlas".into(), oracle::read("atlas_v4_rfoot_s2.json"));
     let hold = pseudo_random(30, 1.0);
-    for dt in [0.001, 0.005] {
+    for dt in [0.001, 0.005].into_iter().filter(|_| wanted("atlas")) {
         report("Atlas, foot-rooted", &case.tree, 2, dt, &case.state.q, &hold);
     }
-    for n in [16, 32, 64, 128] {
+    for n in [16, 32, 64, 128].into_iter().filter(|n| wanted(&n.to_string())) {
         report("chain", &chain(n), 2, 0.005, &pseudo_random(n, 0.3), &vec![0.0; n]);
     }
 }

@@ -645,10 +645,10 @@ fn joint_outward<S: Simd>(simd: S, tree: &KinematicTree, workspace: &mut DelWork
             versine.0[lane] = 1.0 - c;
         }
         let (sin, versine) = (Lane::load(simd, &sin), Lane::load(simd, &versine));
-        e = core::array::from_fn(|k| {
+        for k in 0..9 {
             let bend = versine.mul_add(Lane::splat(simd, constants.e2[k]), e[k]);
-            sin.mul_add(Lane::splat(simd, constants.e1[k]), bend)
-        });
+            e[k] = sin.mul_add(Lane::splat(simd, constants.e1[k]), bend);
+        }
     }
     let joint_origin = splat(simd, &constants.joint_origin);
     let axis = splat(simd, &constants.axis);

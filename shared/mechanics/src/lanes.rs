@@ -5,6 +5,9 @@
 //! and the kernels are written once over a [`Simd`] token. The processor is asked once, when a workspace is built
 //! ([`Instructions::detect`]); a plain build still uses AVX2 and fused multiply-add, and AVX-512 where it pays.
 //!
+//! The functions here are loops over arrays, not closures: a closure that the compiler leaves out of line loses the
+//! instruction set.
+//!
 //! Every kernel is compiled once per instruction set, and scalar code for four lanes takes the compiler longer than all
 //! vector code together. On x86-64 it is therefore an option: without the feature `portable`, processors older than AVX2
 //! (2013) are refused by [`ModelError::Processor`]. Other architectures always have it.
@@ -216,12 +219,15 @@ impl Simd for pulp::x86::V4 {
     }
     #[inline(always)]
     fn wide_load(self, quads: &[Quad; 2]) -> pulp::f64x8 {
-        pulp::cast([quads[0].0, quads[1].0])
+        // By registers: through memory, the wide load would wait for two narrow stores.
+        let low = self.avx512f._mm512_castpd256_pd512(pulp::cast(quads[0].0));
+        pulp::cast(self.avx512f._mm512_insertf64x4::<1>(low, pulp::cast(quads[1].0)))
     }
     #[inline(always)]
     fn wide_store(self, wide: pulp::f64x8) -> [Quad; 2] {
-        let [a, b]: [[f64; 4]; 2] = pulp::cast(wide);
-        [Quad(a), Quad(b)]
+        let wide = pulp::cast(wide);
+        let low = self.avx512f._mm512_castpd512_pd256(wide);
+        [Quad(pulp::cast(low)), Quad(pulp::cast(self.avx512f._mm512_extractf64x4_pd::<1>(wide)))]
     }
     #[inline(always)]
     fn wide_mul_add(self, a: pulp::f64x8, b: pulp::f64x8, c: pulp::f64x8) -> pulp::f64x8 {
@@ -439,37 +445,92 @@ impl<S: Simd> WideLane<S> {
 /// Loads `N` consecutive quads.
 #[inline(always)]
 pub(crate) fn load<S: Simd, const N: usize>(simd: S, quads: &[Quad; N]) -> [Lane<S>; N] {
-    core::array::from_fn(|k| Lane::load(simd, &quads[k]))
+    let mut out = [Lane::splat(simd, 0.0); N];
+    for k in 0..N {
+        out[k] = Lane::load(simd, &quads[k]);
+    }
+    out
+}
+
+/// Loads every `stride`-th quad from `at` on: one node group of six coordinates.
+#[inline(always)]
+pub(crate) fn load_strided<S: Simd, const N: usize>(
+    simd: S,
+    quads: &[Quad],
+    at: usize,
+    stride: usize,
+) -> [Lane<S>; N] {
+    let mut out = [Lane::splat(simd, 0.0); N];
+    for k in 0..N {
+        out[k] = Lane::load(simd, &quads[k * stride + at]);
+    }
+    out
+}
+
+/// `a bᵀ`, row-major.
+#[inline(always)]
+pub(crate) fn outer<S: Simd>(a: Lane3<S>, b: Lane3<S>) -> Lane9<S> {
+    [
+        a[0] * b[0],
+        a[0] * b[1],
+        a[0] * b[2],
+        a[1] * b[0],
+        a[1] * b[1],
+        a[1] * b[2],
+        a[2] * b[0],
+        a[2] * b[1],
+        a[2] * b[2],
+    ]
 }
 
 /// The same constants in every lane.
 #[inline(always)]
 pub(crate) fn splat<S: Simd, const N: usize>(simd: S, values: &[f64; N]) -> [Lane<S>; N] {
-    core::array::from_fn(|k| Lane::splat(simd, values[k]))
+    let mut out = [Lane::splat(simd, 0.0); N];
+    for k in 0..N {
+        out[k] = Lane::splat(simd, values[k]);
+    }
+    out
 }
 
 /// Stores `N` lanes.
 #[inline(always)]
 pub(crate) fn store<S: Simd, const N: usize>(lanes: [Lane<S>; N]) -> [Quad; N] {
-    core::array::from_fn(|k| lanes[k].quad())
+    let mut out = [Quad::ZERO; N];
+    for k in 0..N {
+        out[k] = lanes[k].quad();
+    }
+    out
 }
 
 /// Element-wise sum.
 #[inline(always)]
 pub(crate) fn add<S: Simd, const N: usize>(a: [Lane<S>; N], b: [Lane<S>; N]) -> [Lane<S>; N] {
-    core::array::from_fn(|k| a[k] + b[k])
+    let mut out = a;
+    for k in 0..N {
+        out[k] = a[k] + b[k];
+    }
+    out
 }
 
 /// Element-wise difference.
 #[inline(always)]
 pub(crate) fn sub<S: Simd, const N: usize>(a: [Lane<S>; N], b: [Lane<S>; N]) -> [Lane<S>; N] {
-    core::array::from_fn(|k| a[k] - b[k])
+    let mut out = a;
+    for k in 0..N {
+        out[k] = a[k] - b[k];
+    }
+    out
 }
 
 /// `factor a`, element by element.
 #[inline(always)]
 pub(crate) fn scale<S: Simd, const N: usize>(factor: Lane<S>, a: [Lane<S>; N]) -> [Lane<S>; N] {
-    core::array::from_fn(|k| factor * a[k])
+    let mut out = a;
+    for k in 0..N {
+        out[k] = factor * a[k];
+    }
+    out
 }
 
 /// `factor a + b`, element by element.
@@ -479,7 +540,11 @@ pub(crate) fn scale_add<S: Simd, const N: usize>(
     a: [Lane<S>; N],
     b: [Lane<S>; N],
 ) -> [Lane<S>; N] {
-    core::array::from_fn(|k| factor.mul_add(a[k], b[k]))
+    let mut out = b;
+    for k in 0..N {
+        out[k] = factor.mul_add(a[k], b[k]);
+    }
+    out
 }
 
 /// Scalar product of 3-vectors.
@@ -519,30 +584,37 @@ pub(crate) fn cross_add<S: Simd>(a: Lane3<S>, b: Lane3<S>, c: Lane3<S>) -> Lane3
 /// Row-major matrix times vector.
 #[inline(always)]
 pub(crate) fn mat_vec<S: Simd>(m: &Lane9<S>, v: Lane3<S>) -> Lane3<S> {
-    core::array::from_fn(|r| dot3([m[3 * r], m[3 * r + 1], m[3 * r + 2]], v))
+    [dot3([m[0], m[1], m[2]], v), dot3([m[3], m[4], m[5]], v), dot3([m[6], m[7], m[8]], v)]
 }
 
 /// Row-major matrix times vector, plus a vector.
 #[inline(always)]
 pub(crate) fn mat_vec_add<S: Simd>(m: &Lane9<S>, v: Lane3<S>, b: Lane3<S>) -> Lane3<S> {
-    core::array::from_fn(|r| {
-        m[3 * r + 2].mul_add(v[2], m[3 * r + 1].mul_add(v[1], m[3 * r].mul_add(v[0], b[r])))
-    })
+    let mut out = b;
+    for r in 0..3 {
+        let last = m[3 * r].mul_add(v[0], b[r]);
+        out[r] = m[3 * r + 2].mul_add(v[2], m[3 * r + 1].mul_add(v[1], last));
+    }
+    out
 }
 
 /// Transpose of a row-major matrix times vector.
 #[inline(always)]
 pub(crate) fn mat_tr_vec<S: Simd>(m: &Lane9<S>, v: Lane3<S>) -> Lane3<S> {
-    core::array::from_fn(|c| dot3([m[c], m[3 + c], m[6 + c]], v))
+    [dot3([m[0], m[3], m[6]], v), dot3([m[1], m[4], m[7]], v), dot3([m[2], m[5], m[8]], v)]
 }
 
 /// Product of row-major matrices.
 #[inline(always)]
 pub(crate) fn mat_mul<S: Simd>(a: &Lane9<S>, b: &Lane9<S>) -> Lane9<S> {
-    core::array::from_fn(|k| {
-        let (r, c) = (k / 3, k % 3);
-        dot3([a[3 * r], a[3 * r + 1], a[3 * r + 2]], [b[c], b[3 + c], b[6 + c]])
-    })
+    let mut out = *b;
+    for r in 0..3 {
+        let row = [a[3 * r], a[3 * r + 1], a[3 * r + 2]];
+        for c in 0..3 {
+            out[3 * r + c] = dot3(row, [b[c], b[3 + c], b[6 + c]]);
+        }
+    }
+    out
 }
 
 /// Symmetric matrix (xx, yy, zz, xy, xz, yz) times vector.

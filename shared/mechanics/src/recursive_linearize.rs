@@ -147,22 +147,12 @@ impl Responses {
         for g in 0..self.groups {
             let body = &del.bodies[i * self.groups + g];
             let mut sum: [Lane<S>; 12] = load(simd, &self.fixed_directions[i * self.groups + g]);
-            let mut put = |arm: Lane3<S>, force: Lane3<S>, couple: bool| {
-                for (t, x) in sum.iter_mut().zip(arm_cross_force(arm, force)) {
-                    *t = *t + x;
-                }
-                if !couple {
-                    for k in 0..3 {
-                        sum[9 + k] = sum[9 + k] + force[k];
-                    }
-                }
-            };
-            put(load(simd, &body.position), weight, false);
+            add_force(&mut sum, load(simd, &body.position), weight, false);
             for (index, dead) in del.loads.iter().enumerate().filter(|(_, dead)| dead.body == i) {
                 let (force, arm) = load_arm(simd, dead, &del.load_forces[index * self.groups + g], body);
-                put(arm, force, dead.couple);
+                add_force(&mut sum, arm, force, dead.couple);
             }
-            let arm_cross = core::array::from_fn(|k| sum[k]);
+            let arm_cross = [sum[0], sum[1], sum[2], sum[3], sum[4], sum[5], sum[6], sum[7], sum[8]];
             let force = [sum[9], sum[10], sum[11]];
             let step = Lane::load(simd, &del.weights[g]);
             let twist: Lane6<S> = load(simd, &body.joint_twist);
@@ -304,6 +294,20 @@ impl Responses {
     }
 }
 
+/// Adds a force of fixed direction to the sums of a subtree.
+#[inline(always)]
+fn add_force<S: Simd>(sum: &mut [Lane<S>; 12], arm: Lane3<S>, force: Lane3<S>, couple: bool) {
+    let product = arm_cross_force(arm, force);
+    for k in 0..9 {
+        sum[k] = sum[k] + product[k];
+    }
+    if !couple {
+        for k in 0..3 {
+            sum[9 + k] = sum[9 + k] + force[k];
+        }
+    }
+}
+
 /// Sixteen columns of one quantity.
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
@@ -354,17 +358,17 @@ const NONE: usize = usize::MAX;
 /// Memory of the sweeps.
 #[derive(Clone, Debug)]
 pub(crate) struct ColumnSweeps {
-    /// `y0`, one slot per open branch; the last six rows of a slot are `Γ̃^0`.
+    /// `y0`, one slot per open branch, handed from child to parent; the last six rows of a slot are `Γ̃^0`.
     outputs: Vec<Tile>,
     output_slot: Vec<usize>,
-    /// `ζ` and `η^s`, one slot per body whose children are still to come.
+    free: Vec<usize>,
+    /// `ζ` and `η^s`, one slot per body whose children are still to come. Slot 0 is the ground: zero.
     inputs: Vec<Tile>,
     input_slot: Vec<usize>,
     /// `g_i` and `C_i^sᵀ y0_i`.
     pending: Vec<Tile>,
-    /// Whether the inward sweep has reached a body, and its slot holds something.
+    /// Whether the inward sweep has reached a body.
     reached: Vec<bool>,
-    open: Vec<bool>,
     /// Lanes that start at a body: head of the list, and the next lane of a lane.
     first_lane: Vec<usize>,
     next_lane: [usize; Tile::COLUMNS],
@@ -373,16 +377,16 @@ pub(crate) struct ColumnSweeps {
 impl ColumnSweeps {
     pub fn new(tree: &KinematicTree, shape: &Interface) -> Self {
         let bodies = tree.body_count();
-        let (output_slot, output_slots) = assign_slots(tree);
+        let output_slots = assign_slots(tree).1;
         let (input_slot, input_slots) = assign_input_slots(tree);
         Self {
             outputs: vec![Tile::ZERO; output_slots * (shape.outputs() + 6)],
-            output_slot,
+            output_slot: vec![NONE; bodies],
+            free: (0..output_slots).collect(),
             inputs: vec![Tile::ZERO; input_slots * (shape.inputs() + 3)],
             input_slot,
             pending: vec![Tile::ZERO; bodies * (shape.s + 1)],
             reached: vec![false; bodies],
-            open: vec![false; bodies],
             first_lane: vec![NONE; bodies],
             next_lane: [NONE; Tile::COLUMNS],
         }
@@ -398,7 +402,7 @@ fn assign_input_slots(tree: &KinematicTree) -> (Vec<usize>, usize) {
     }
     let mut slot_of = vec![NONE; bodies];
     let mut free: Vec<usize> = Vec::new();
-    let mut count = 0;
+    let mut count = 1;
     for (i, constants) in tree.constants().iter().enumerate() {
         if constants.parent != NO_PARENT && last_child[constants.parent] == i {
             if last_child[i] == NONE {
@@ -467,7 +471,7 @@ fn start_of(work: &AllColumns<'_>, column: usize) -> (usize, Start) {
 fn place_starts(work: &mut AllColumns<'_>, first: usize) {
     work.sweeps.first_lane.fill(NONE);
     work.sweeps.reached.fill(false);
-    work.sweeps.open.fill(false);
+    work.sweeps.output_slot.fill(NONE);
     for lane in 0..Tile::COLUMNS.min(work.out.columns() - first) {
         let (body, _) = start_of(work, first + lane);
         work.sweeps.next_lane[lane] = work.sweeps.first_lane[body];
@@ -491,16 +495,21 @@ fn inward<S: Simd, const N: usize>(simd: S, work: &mut AllColumns<'_>, first: us
         let (columns, record) = record.split_at(momenta * (s + 1));
         let (twists, record) = record.split_at(6 * (s + 1));
         let (inverse, u) = record.split_at(s * s);
-        let own = work.sweeps.output_slot[i] * (no + 6);
-        let open = work.sweeps.open[i];
+        let parent = work.tree.constants()[i].parent;
+        let slot = work.sweeps.output_slot[i];
         let mut sums = [zero; N];
-        if open {
-            let y = &work.sweeps.outputs[own..own + no + 6];
-            for (y, c) in y[..momenta].iter().zip(columns.chunks_exact(s + 1)) {
-                let y = get(simd, y);
+        if slot != NONE {
+            let y = &work.sweeps.outputs[slot * (no + 6)..(slot + 1) * (no + 6)];
+            let mut odd = [zero; N];
+            for (y, c) in y[..momenta].chunks_exact(2).zip(columns.chunks_exact(2 * (s + 1))) {
+                let [first, second] = [get(simd, &y[0]), get(simd, &y[1])];
                 for r in 0..=s {
-                    sums[r] = mul_add(simd, c[r], y, sums[r]);
+                    sums[r] = mul_add(simd, c[r], first, sums[r]);
+                    odd[r] = mul_add(simd, c[s + 1 + r], second, odd[r]);
                 }
+            }
+            for r in 0..=s {
+                sums[r] = mul_add(simd, 1.0, odd[r], sums[r]);
             }
             for (block, (y, twist)) in y[momenta..].chunks_exact(6).zip(twists.chunks_exact(6)).enumerate() {
                 // Blocks DΓ^1..DΓ^s act on their own row, the last one (Γ̃^0) on row 0.
@@ -538,8 +547,10 @@ fn inward<S: Simd, const N: usize>(simd: S, work: &mut AllColumns<'_>, first: us
             }
             lane = work.sweeps.next_lane[lane];
         }
-        let parent = work.tree.constants()[i].parent;
         if parent == NO_PARENT {
+            if slot != NONE {
+                work.sweeps.free.push(slot);
+            }
             continue;
         }
         if starts {
@@ -547,44 +558,44 @@ fn inward<S: Simd, const N: usize>(simd: S, work: &mut AllColumns<'_>, first: us
                 g[alpha] = get(simd, &work.sweeps.pending[i * (s + 1) + alpha]);
             }
         }
-        let to = work.sweeps.output_slot[parent] * (no + 6);
-        let parent_open = work.sweeps.open[parent];
-        let (source, target) = if own < to {
-            let (low, high) = work.sweeps.outputs.split_at_mut(to);
-            (&low[own..own + no + 6], &mut high[..no + 6])
-        } else {
-            let (low, high) = work.sweeps.outputs.split_at_mut(own);
-            (&high[..no + 6], &mut low[to..to + no + 6])
-        };
-        let carried = |target: &Tile, source: &Tile| {
-            let mut sum = if parent_open { get(simd, target) } else { zero };
-            if open {
-                sum = mul_add(simd, 1.0, get(simd, source), sum);
+        let own = match slot {
+            NONE => {
+                let Some(new) = work.sweeps.free.pop() else { continue };
+                work.sweeps.outputs[new * (no + 6)..(new + 1) * (no + 6)].fill(Tile::ZERO);
+                new
             }
-            sum
+            slot => slot,
         };
-        for ((target, source), u) in target[..no].iter_mut().zip(source).zip(u.chunks_exact(s)) {
-            let mut sum = carried(target, source);
+        let y = &mut work.sweeps.outputs[own * (no + 6)..(own + 1) * (no + 6)];
+        for (y, u) in y[..no].iter_mut().zip(u.chunks_exact(s)) {
+            let mut sum = get(simd, y);
             for k in 0..s {
                 sum = mul_add(simd, u[k], g[k], sum);
             }
-            *target = put(sum);
+            *y = put(sum);
         }
-        for (target, source) in target[no..].iter_mut().zip(&source[no..]) {
-            *target = put(carried(target, source));
-        }
-        work.sweeps.open[parent] = true;
-        work.sweeps.reached[parent] = true;
         let mut lane = work.sweeps.first_lane[i];
         while lane != NONE {
             if let Start::Coordinate = start_of(work, first + lane).1 {
                 let start = &work.responses.starts[i * lengths.start + s..][..no + 6];
-                let target = &mut work.sweeps.outputs[to..to + no + 6];
-                for (target, value) in target.iter_mut().zip(start) {
-                    target.add_to_lane(lane, *value);
+                let y = &mut work.sweeps.outputs[own * (no + 6)..(own + 1) * (no + 6)];
+                for (y, value) in y.iter_mut().zip(start) {
+                    y.add_to_lane(lane, *value);
                 }
             }
             lane = work.sweeps.next_lane[lane];
+        }
+        work.sweeps.reached[parent] = true;
+        let to = work.sweeps.output_slot[parent];
+        if to == NONE {
+            work.sweeps.output_slot[parent] = own;
+            continue;
+        }
+        work.sweeps.free.push(own);
+        for k in 0..no + 6 {
+            let sum = get(simd, &work.sweeps.outputs[to * (no + 6) + k]);
+            let sum = mul_add(simd, 1.0, get(simd, &work.sweeps.outputs[own * (no + 6) + k]), sum);
+            work.sweeps.outputs[to * (no + 6) + k] = put(sum);
         }
     }
 }
@@ -604,15 +615,28 @@ fn outward<S: Simd, const N: usize>(simd: S, work: &mut AllColumns<'_>, first: u
         let (end_by_x, record) = record.split_at(s);
         let (twists, rates) = record.split_at(3 * s);
         let parent = work.tree.constants()[i].parent;
-        let from = if parent == NO_PARENT { NONE } else { work.sweeps.input_slot[parent] * (ni + 3) };
+        let from = if parent == NO_PARENT { 0 } else { work.sweeps.input_slot[parent] * (ni + 3) };
         let mut sums = [zero; N];
-        if from != NONE {
+        if parent != NO_PARENT {
             let inputs = &work.sweeps.inputs[from..from + ni + 3];
-            for (input, row) in inputs[..ni].iter().zip(rows.chunks_exact(s + 1)) {
+            // Two accumulators per row hide the latency of the multiply-add.
+            let mut odd = [zero; N];
+            let (pairs, rest) = inputs[..ni].split_at(ni - ni % 2);
+            for (pair, row) in pairs.chunks_exact(2).zip(rows.chunks_exact(2 * (s + 1))) {
+                let [first, second] = [get(simd, &pair[0]), get(simd, &pair[1])];
+                for r in 0..=s {
+                    sums[r] = mul_add(simd, row[r], first, sums[r]);
+                    odd[r] = mul_add(simd, row[s + 1 + r], second, odd[r]);
+                }
+            }
+            for (input, row) in rest.iter().zip(rows[(ni - ni % 2) * (s + 1)..].chunks_exact(s + 1)) {
                 let input = get(simd, input);
                 for r in 0..=s {
                     sums[r] = mul_add(simd, row[r], input, sums[r]);
                 }
+            }
+            for r in 0..=s {
+                sums[r] = mul_add(simd, 1.0, odd[r], sums[r]);
             }
             for (input, c) in inputs[ni..].iter().zip(end_row) {
                 sums[s] = mul_add(simd, *c, get(simd, input), sums[s]);
@@ -649,18 +673,18 @@ fn outward<S: Simd, const N: usize>(simd: S, work: &mut AllColumns<'_>, first: u
             // The last child works in place, in the slot of its parent.
             for k in 0..shape.eta {
                 let at = shape.eta_at(0) + k;
-                inputs[own + at] = put(carried(simd, inputs, from, at));
+                inputs[own + at] = put(get(simd, &inputs[from + at]));
             }
             for (gamma, twist) in (1..=s).zip(twists.chunks_exact(3)) {
                 let block = if gamma == s { ni } else { shape.eta_at(gamma) };
                 for (k, factor) in twist.iter().enumerate() {
-                    let eta = carried(simd, inputs, from, block + k);
+                    let eta = get(simd, &inputs[from + block + k]);
                     inputs[own + block + k] = put(mul_add(simd, *factor, x[gamma - 1], eta));
                 }
             }
             for (k, factors) in rates.chunks_exact(s).enumerate() {
                 let at = shape.nu_at(0) + k;
-                let mut nu = carried(simd, inputs, from, at);
+                let mut nu = get(simd, &inputs[from + at]);
                 for gamma in 0..s {
                     nu = mul_add(simd, factors[gamma], x[gamma], nu);
                 }
@@ -690,10 +714,4 @@ fn outward<S: Simd, const N: usize>(simd: S, work: &mut AllColumns<'_>, first: u
             lane = work.sweeps.next_lane[lane];
         }
     }
-}
-
-/// Entry `k` of the slot that starts at `from`; zero for the ground.
-#[inline(always)]
-fn carried<S: Simd>(simd: S, inputs: &[Tile], from: usize, k: usize) -> Wide<S> {
-    if from == NONE { [WideLane::splat(simd, 0.0); 2] } else { get(simd, &inputs[from + k]) }
 }

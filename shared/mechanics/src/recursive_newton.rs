@@ -47,7 +47,8 @@ use crate::dense_lu::DenseLu;
 use crate::errors::FactorError;
 use crate::kinetic_hessian::own_inertia;
 use crate::lanes::{
-    Instructions, Kernel, LANES, Lane, Lane3, Lane6, Quad, Simd, dot3, dual_bracket, load, splat, store,
+    Instructions, Kernel, LANES, Lane, Lane3, Lane6, Quad, Simd, dot3, dual_bracket, load, outer, splat,
+    store,
 };
 use crate::lobatto::MAX_UNKNOWN_NODES;
 use crate::newton_direction::{NewtonDirection, base_matrix, second_order_matrix};
@@ -450,7 +451,7 @@ fn own_response<S: Simd>(
 #[inline(always)]
 pub(crate) fn arm_cross_force<S: Simd>(arm: Lane3<S>, force: Lane3<S>) -> [Lane<S>; 9] {
     let along = dot3(arm, force);
-    let mut product: [Lane<S>; 9] = core::array::from_fn(|k| force[k / 3] * arm[k % 3]);
+    let mut product = outer(force, arm);
     for k in 0..3 {
         product[4 * k] = product[4 * k] - along;
     }
