@@ -125,21 +125,19 @@ fn run(algorithm: &str, n: usize, repeats: usize) {
                 black_box(&mut vector);
             }
         }
-        "tangent" | "matrix" => {
-            let method =
-                if algorithm == "tangent" { NewtonMethod::Recursive } else { NewtonMethod::BranchLu };
+        "recursion" | "tangent" | "matrix" => {
+            let method = if algorithm == "matrix" { NewtonMethod::BranchLu } else { NewtonMethod::Recursive };
             let options = StepOptions { method: Some(method), dense_fallback: 0, ..StepOptions::default() };
             let mut integrator = Integrator::new(&tree, &rule, TIME_STEP, options).unwrap();
             place_nodes(integrator.del_and_solver().0);
             let coordinates = StateCoordinates::Momentum;
             let mut work = Linearizer::new(&tree, &integrator, coordinates, InputHold::Held).unwrap();
             for _ in 0..repeats {
-                let step = if algorithm == "tangent" {
-                    work.linearize_by_tangent(&tree, &mut integrator).unwrap()
-                } else {
-                    work.linearize(&tree, &mut integrator).unwrap()
-                };
-                black_box(step);
+                black_box(match algorithm {
+                    "recursion" => work.linearize_by_recursion(&tree, &mut integrator).unwrap(),
+                    "tangent" => work.linearize_by_tangent(&tree, &mut integrator).unwrap(),
+                    _ => work.linearize(&tree, &mut integrator).unwrap(),
+                });
             }
         }
         other => panic!("no algorithm '{other}'"),

@@ -104,7 +104,7 @@ impl BranchLu {
             let (rows, columns) = (&mut self.rows, &mut self.columns);
             let (row_starts, row_quads) = (&self.row_starts, &self.row_quads);
             let (column_starts, column_quads) = (&self.column_starts, &self.column_quads);
-            jacobian_column_rule(tree, del, &self.hessian, |row, column, entry| {
+            jacobian_column_rule(tree, del, &self.hessian, &mut |row, column, entry| {
                 let (row_dof, column_dof) = (row / s, column / s);
                 // Joint column of a base row: in the column panel; everything else: in the row panel.
                 let target = if column_dof >= 6 {

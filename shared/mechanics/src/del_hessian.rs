@@ -41,8 +41,8 @@ use crate::floating_base::{BaseLanes, second_order, second_order_rate};
 use crate::gravity_hessian::gravity_column;
 use crate::kinetic_hessian::{CompositeLanes, composite_times, kinetic_columns, own_inertia};
 use crate::lanes::{
-    Kernel, LANES, Lane, Lane3, Lane6, Lane9, Quad, Simd, add, cross, dot3, dot6, dual_bracket, halves, join,
-    load, mat_tr_vec, scale, splat, store, sub,
+    Kernel, LANES, Lane, Lane3, Lane6, Quad, Simd, add, cross, dot3, dot6, dual_bracket, halves, join, load,
+    load_strided, mat_tr_vec, outer, scale, splat, store, sub,
 };
 use crate::tree::{KinematicTree, NO_PARENT};
 
@@ -416,7 +416,7 @@ fn own_dead_loads<S: Simd>(simd: S, del: &DelWorkspace, hessian: &mut DelHessian
             let (force, arm) = load_arm(simd, load_, &del.load_forces[index * groups + g], &del.bodies[at]);
             // x^ f^ = f xᵀ - (x·f) 1
             let along = dot3(arm, force);
-            let mut product: Lane9<S> = core::array::from_fn(|k| force[k / 3] * arm[k % 3]);
+            let mut product = outer(force, arm);
             for k in 0..3 {
                 product[4 * k] = product[4 * k] - along;
             }
@@ -479,12 +479,20 @@ fn fixed_direction_gain<S: Simd>(
 
 #[inline(always)]
 fn matrix_times<S: Simd>(simd: S, m: &[Quad; 36], x: Lane6<S>) -> Lane6<S> {
-    core::array::from_fn(|r| dot6(core::array::from_fn(|c| Lane::load(simd, &m[6 * r + c])), x))
+    let mut out = x;
+    for r in 0..6 {
+        out[r] = dot6(load_strided(simd, m, 6 * r, 1), x);
+    }
+    out
 }
 
 #[inline(always)]
 fn matrix_tr_times<S: Simd>(simd: S, m: &[Quad; 36], x: Lane6<S>) -> Lane6<S> {
-    core::array::from_fn(|c| dot6(core::array::from_fn(|r| Lane::load(simd, &m[6 * r + c])), x))
+    let mut out = x;
+    for c in 0..6 {
+        out[c] = dot6(load_strided(simd, m, c, 6), x);
+    }
+    out
 }
 
 #[inline(always)]

@@ -123,7 +123,8 @@ impl DelWorkspace {
     /// A workspace for steps of `time_step` (s) of `tree` by `rule`.
     ///
     /// # Errors
-    /// [`ModelError::TimeStep`] unless the step is positive and finite.
+    /// [`ModelError::TimeStep`] unless the step is positive and finite; [`ModelError::Processor`] on x86-64 older than AVX2
+    /// (feature `portable`).
     pub fn new(
         tree: &KinematicTree,
         rule: &LobattoRule,
@@ -145,7 +146,7 @@ impl DelWorkspace {
         let (dof, bodies) = (tree.dof() * groups, tree.body_count() * groups);
         let gains = if tree.has_body_wrenches() || capacity.laws { bodies } else { 0 };
         let mut workspace = Self {
-            instructions: Instructions::detect(),
+            instructions: Instructions::detect()?,
             rule: rule.clone(),
             time_step: 0.0,
             groups,
@@ -644,10 +645,10 @@ fn joint_outward<S: Simd>(simd: S, tree: &KinematicTree, workspace: &mut DelWork
             versine.0[lane] = 1.0 - c;
         }
         let (sin, versine) = (Lane::load(simd, &sin), Lane::load(simd, &versine));
-        e = core::array::from_fn(|k| {
+        for k in 0..9 {
             let bend = versine.mul_add(Lane::splat(simd, constants.e2[k]), e[k]);
-            sin.mul_add(Lane::splat(simd, constants.e1[k]), bend)
-        });
+            e[k] = sin.mul_add(Lane::splat(simd, constants.e1[k]), bend);
+        }
     }
     let joint_origin = splat(simd, &constants.joint_origin);
     let axis = splat(simd, &constants.axis);

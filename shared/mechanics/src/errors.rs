@@ -4,6 +4,11 @@
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum ModelError {
+    /// The processor lacks AVX2 or fused multiply-add and the crate was built without code for it.
+    #[error(
+        "this processor has no AVX2 with fused multiply-add: build delmpc-mechanics with the feature `portable`"
+    )]
+    Processor,
     /// Number of unknown nodes outside `1..=limit`.
     #[error("{unknown_nodes} unknown nodes per step are not supported: use 1 to {limit}")]
     UnsupportedOrder {

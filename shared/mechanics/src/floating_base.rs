@@ -65,7 +65,7 @@
 
 use crate::lanes::{
     Lane, Lane3, Lane6, Lane9, Quad, Simd, add, cross, cross_add, dot3, halves, join, load, mat_mul,
-    mat_tr_vec, mat_vec, scale, scale_add, splat, store,
+    mat_tr_vec, mat_vec, outer, scale, scale_add, splat, store,
 };
 
 /// Largest chart rotation `|ω^s|` accepted for a step, rad: half of the rotation of the step.
@@ -256,7 +256,12 @@ pub(crate) fn second_order_rate<S: Simd>(simd: S, base: &BaseLanes, wrench: Lane
 /// `N x` for the 6 x 3 matrices above and a 6-vector of chart coordinates.
 #[inline(always)]
 pub(crate) fn apply_second_order<S: Simd>(n: &[Lane<S>; 18], x: Lane6<S>) -> Lane6<S> {
-    core::array::from_fn(|r| dot3([n[3 * r], n[3 * r + 1], n[3 * r + 2]], [x[0], x[1], x[2]]))
+    let x = [x[0], x[1], x[2]];
+    let mut out = [x[0]; 6];
+    for r in 0..6 {
+        out[r] = dot3([n[3 * r], n[3 * r + 1], n[3 * r + 2]], x);
+    }
+    out
 }
 
 #[inline(always)]
@@ -267,29 +272,42 @@ fn central_wrench<S: Simd>(simd: S, base: &BaseLanes, wrench: Lane6<S>) -> (Lane
     (mat_tr_vec(&center, central), mat_tr_vec(&center, force))
 }
 
-#[inline(always)]
-fn series_lanes<S: Simd>(simd: S, q_hat: Lane<S>) -> [Lane3<S>; 3] {
-    let coefficient = |row: usize, term: usize, derivative: usize| {
-        let mut value = SERIES[row][term];
-        for j in 0..derivative {
-            value *= (term - j) as f64;
-        }
-        Lane::splat(simd, value)
-    };
-    core::array::from_fn(|derivative| {
-        core::array::from_fn(|row| {
-            let mut sum = coefficient(row, TERMS - 1, derivative);
-            for term in (derivative..TERMS - 1).rev() {
-                sum = sum.mul_add(q_hat, coefficient(row, term, derivative));
+/// Coefficients of the derivatives of [`SERIES`] (terms below the order of the derivative are zero).
+const DERIVATIVES: [[[f64; TERMS]; 3]; 3] = {
+    let mut table = [SERIES; 3];
+    let mut derivative = 0;
+    while derivative < 3 {
+        let mut row = 0;
+        while row < 3 {
+            let mut term = 0;
+            while term < TERMS {
+                let mut j = 0;
+                while j < derivative {
+                    table[derivative][row][term] *= term as f64 - j as f64;
+                    j += 1;
+                }
+                term += 1;
             }
-            sum
-        })
-    })
-}
+            row += 1;
+        }
+        derivative += 1;
+    }
+    table
+};
 
 #[inline(always)]
-fn outer<S: Simd>(a: Lane3<S>, b: Lane3<S>) -> Lane9<S> {
-    core::array::from_fn(|k| a[k / 3] * b[k % 3])
+fn series_lanes<S: Simd>(simd: S, q_hat: Lane<S>) -> [Lane3<S>; 3] {
+    let mut out = [[q_hat; 3]; 3];
+    for derivative in 0..3 {
+        for row in 0..3 {
+            let mut sum = Lane::splat(simd, DERIVATIVES[derivative][row][TERMS - 1]);
+            for term in (derivative..TERMS - 1).rev() {
+                sum = sum.mul_add(q_hat, Lane::splat(simd, DERIVATIVES[derivative][row][term]));
+            }
+            out[derivative][row] = sum;
+        }
+    }
+    out
 }
 
 /// `m += factor v^`.
@@ -338,13 +356,22 @@ fn n_upper<S: Simd>(
 /// `-m^ A`.
 #[inline(always)]
 fn neg_cross_matrix<S: Simd>(m: Lane3<S>, a: &Lane9<S>) -> Lane9<S> {
-    let columns: [Lane3<S>; 3] = core::array::from_fn(|c| cross([a[c], a[3 + c], a[6 + c]], m));
-    core::array::from_fn(|k| columns[k % 3][k / 3])
+    let mut out = *a;
+    for c in 0..3 {
+        let column = cross([a[c], a[3 + c], a[6 + c]], m);
+        for r in 0..3 {
+            out[3 * r + c] = column[r];
+        }
+    }
+    out
 }
 
 #[inline(always)]
 fn stack<S: Simd>(upper: Lane9<S>, lower: Lane9<S>) -> [Lane<S>; 18] {
-    core::array::from_fn(|k| if k < 9 { upper[k] } else { lower[k - 9] })
+    let mut out = [upper[0]; 18];
+    out[..9].copy_from_slice(&upper);
+    out[9..].copy_from_slice(&lower);
+    out
 }
 
 /// `N^α(X)` at one node as a 6 x 6 matrix.

@@ -3,9 +3,18 @@
 //! The recursions of the paper do the same arithmetic at every node `α = 0..s`. Here one lane is one node: a quantity of
 //! a body is stored as a [`Quad`] of four doubles (nodes 0..3; a rule with more nodes uses several quads, its *groups*),
 //! and the kernels are written once over a [`Simd`] token. The processor is asked once, when a workspace is built
-//! ([`Instructions::detect`]); a plain build still uses AVX2 and fused multiply-add where they exist.
+//! ([`Instructions::detect`]); a plain build still uses AVX2 and fused multiply-add, and AVX-512 where it pays.
+//!
+//! The functions here are loops over arrays, not closures: a closure that the compiler leaves out of line loses the
+//! instruction set.
+//!
+//! Every kernel is compiled once per instruction set, and scalar code for four lanes takes the compiler longer than all
+//! vector code together. On x86-64 it is therefore an option: without the feature `portable`, processors older than AVX2
+//! (2013) are refused by [`ModelError::Processor`]. Other architectures always have it.
 
 use core::ops::{Add, Mul, Neg, Sub};
+
+use crate::errors::ModelError;
 
 /// Lanes in a [`Quad`].
 pub(crate) const LANES: usize = 4;
@@ -78,14 +87,17 @@ macro_rules! wide_as_two_lanes {
 }
 
 /// Plain arrays: what every processor can do.
+#[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Portable;
 
+#[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
 #[inline(always)]
 fn zip(a: [f64; 4], b: [f64; 4], f: impl Fn(f64, f64) -> f64) -> [f64; 4] {
     [f(a[0], b[0]), f(a[1], b[1]), f(a[2], b[2]), f(a[3], b[3])]
 }
 
+#[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
 impl Simd for Portable {
     const SPECIALISE: bool = false;
     wide_as_two_lanes!();
@@ -207,12 +219,15 @@ impl Simd for pulp::x86::V4 {
     }
     #[inline(always)]
     fn wide_load(self, quads: &[Quad; 2]) -> pulp::f64x8 {
-        pulp::cast([quads[0].0, quads[1].0])
+        // By registers: through memory, the wide load would wait for two narrow stores.
+        let low = self.avx512f._mm512_castpd256_pd512(pulp::cast(quads[0].0));
+        pulp::cast(self.avx512f._mm512_insertf64x4::<1>(low, pulp::cast(quads[1].0)))
     }
     #[inline(always)]
     fn wide_store(self, wide: pulp::f64x8) -> [Quad; 2] {
-        let [a, b]: [[f64; 4]; 2] = pulp::cast(wide);
-        [Quad(a), Quad(b)]
+        let wide = pulp::cast(wide);
+        let low = self.avx512f._mm512_castpd512_pd256(wide);
+        [Quad(pulp::cast(low)), Quad(pulp::cast(self.avx512f._mm512_extractf64x4_pd::<1>(wide)))]
     }
     #[inline(always)]
     fn wide_mul_add(self, a: pulp::f64x8, b: pulp::f64x8, c: pulp::f64x8) -> pulp::f64x8 {
@@ -234,6 +249,7 @@ pub(crate) trait Kernel {
 /// The instruction set the kernels use, found out once.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Instructions {
+    #[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
     Portable,
     #[cfg(target_arch = "x86_64")]
     V3(pulp::x86::V3),
@@ -243,22 +259,29 @@ pub(crate) enum Instructions {
 
 impl Instructions {
     /// The best the processor offers.
-    pub fn detect() -> Self {
+    ///
+    /// # Errors
+    /// [`ModelError::Processor`] on x86-64 without AVX2 and fused multiply-add, unless built with the feature `portable`.
+    pub fn detect() -> Result<Self, ModelError> {
         #[cfg(target_arch = "x86_64")]
         if let Some(v3) = pulp::x86::V3::try_new() {
-            return match pulp::x86::V4::try_new() {
+            return Ok(match pulp::x86::V4::try_new() {
                 Some(v4) => Self::V4(v3, v4),
                 None => Self::V3(v3),
-            };
+            });
         }
-        Self::Portable
+        #[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
+        return Ok(Self::Portable);
+        #[cfg(not(any(not(target_arch = "x86_64"), feature = "portable")))]
+        Err(ModelError::Processor)
     }
 
     /// Runs a kernel with these instructions enabled.
     #[inline(always)]
     pub fn dispatch<K: Kernel>(self, kernel: K) -> K::Output {
         match self {
-            Self::Portable => kernel.run(Portable),
+            #[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
+            Self::Portable => run_portably(kernel),
             #[cfg(target_arch = "x86_64")]
             Self::V3(v3) | Self::V4(v3, _) => pulp::Simd::vectorize(v3, With { kernel, simd: v3 }),
         }
@@ -273,6 +296,13 @@ impl Instructions {
             other => other.dispatch(kernel),
         }
     }
+}
+
+/// Out of line, so that a kernel is compiled once however often it is dispatched.
+#[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
+#[inline(never)]
+fn run_portably<K: Kernel>(kernel: K) -> K::Output {
+    kernel.run(Portable)
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -373,6 +403,14 @@ impl<S: Simd> WideLane<S> {
     pub fn splat(simd: S, x: f64) -> Self {
         Self { simd, wide: simd.wide_splat(x) }
     }
+    #[inline(always)]
+    pub fn of(simd: S, quads: &[Quad; 2]) -> Self {
+        Self { simd, wide: simd.wide_load(quads) }
+    }
+    #[inline(always)]
+    pub fn quads(self) -> [Quad; 2] {
+        self.simd.wide_store(self.wide)
+    }
     /// The two quads of `row` from `at` on; zero when the row is too short (which the callers rule out).
     #[inline(always)]
     pub fn load(simd: S, row: &[Quad], at: usize) -> Self {
@@ -407,37 +445,92 @@ impl<S: Simd> WideLane<S> {
 /// Loads `N` consecutive quads.
 #[inline(always)]
 pub(crate) fn load<S: Simd, const N: usize>(simd: S, quads: &[Quad; N]) -> [Lane<S>; N] {
-    core::array::from_fn(|k| Lane::load(simd, &quads[k]))
+    let mut out = [Lane::splat(simd, 0.0); N];
+    for k in 0..N {
+        out[k] = Lane::load(simd, &quads[k]);
+    }
+    out
+}
+
+/// Loads every `stride`-th quad from `at` on: one node group of six coordinates.
+#[inline(always)]
+pub(crate) fn load_strided<S: Simd, const N: usize>(
+    simd: S,
+    quads: &[Quad],
+    at: usize,
+    stride: usize,
+) -> [Lane<S>; N] {
+    let mut out = [Lane::splat(simd, 0.0); N];
+    for k in 0..N {
+        out[k] = Lane::load(simd, &quads[k * stride + at]);
+    }
+    out
+}
+
+/// `a bᵀ`, row-major.
+#[inline(always)]
+pub(crate) fn outer<S: Simd>(a: Lane3<S>, b: Lane3<S>) -> Lane9<S> {
+    [
+        a[0] * b[0],
+        a[0] * b[1],
+        a[0] * b[2],
+        a[1] * b[0],
+        a[1] * b[1],
+        a[1] * b[2],
+        a[2] * b[0],
+        a[2] * b[1],
+        a[2] * b[2],
+    ]
 }
 
 /// The same constants in every lane.
 #[inline(always)]
 pub(crate) fn splat<S: Simd, const N: usize>(simd: S, values: &[f64; N]) -> [Lane<S>; N] {
-    core::array::from_fn(|k| Lane::splat(simd, values[k]))
+    let mut out = [Lane::splat(simd, 0.0); N];
+    for k in 0..N {
+        out[k] = Lane::splat(simd, values[k]);
+    }
+    out
 }
 
 /// Stores `N` lanes.
 #[inline(always)]
 pub(crate) fn store<S: Simd, const N: usize>(lanes: [Lane<S>; N]) -> [Quad; N] {
-    core::array::from_fn(|k| lanes[k].quad())
+    let mut out = [Quad::ZERO; N];
+    for k in 0..N {
+        out[k] = lanes[k].quad();
+    }
+    out
 }
 
 /// Element-wise sum.
 #[inline(always)]
 pub(crate) fn add<S: Simd, const N: usize>(a: [Lane<S>; N], b: [Lane<S>; N]) -> [Lane<S>; N] {
-    core::array::from_fn(|k| a[k] + b[k])
+    let mut out = a;
+    for k in 0..N {
+        out[k] = a[k] + b[k];
+    }
+    out
 }
 
 /// Element-wise difference.
 #[inline(always)]
 pub(crate) fn sub<S: Simd, const N: usize>(a: [Lane<S>; N], b: [Lane<S>; N]) -> [Lane<S>; N] {
-    core::array::from_fn(|k| a[k] - b[k])
+    let mut out = a;
+    for k in 0..N {
+        out[k] = a[k] - b[k];
+    }
+    out
 }
 
 /// `factor a`, element by element.
 #[inline(always)]
 pub(crate) fn scale<S: Simd, const N: usize>(factor: Lane<S>, a: [Lane<S>; N]) -> [Lane<S>; N] {
-    core::array::from_fn(|k| factor * a[k])
+    let mut out = a;
+    for k in 0..N {
+        out[k] = factor * a[k];
+    }
+    out
 }
 
 /// `factor a + b`, element by element.
@@ -447,7 +540,11 @@ pub(crate) fn scale_add<S: Simd, const N: usize>(
     a: [Lane<S>; N],
     b: [Lane<S>; N],
 ) -> [Lane<S>; N] {
-    core::array::from_fn(|k| factor.mul_add(a[k], b[k]))
+    let mut out = b;
+    for k in 0..N {
+        out[k] = factor.mul_add(a[k], b[k]);
+    }
+    out
 }
 
 /// Scalar product of 3-vectors.
@@ -487,30 +584,37 @@ pub(crate) fn cross_add<S: Simd>(a: Lane3<S>, b: Lane3<S>, c: Lane3<S>) -> Lane3
 /// Row-major matrix times vector.
 #[inline(always)]
 pub(crate) fn mat_vec<S: Simd>(m: &Lane9<S>, v: Lane3<S>) -> Lane3<S> {
-    core::array::from_fn(|r| dot3([m[3 * r], m[3 * r + 1], m[3 * r + 2]], v))
+    [dot3([m[0], m[1], m[2]], v), dot3([m[3], m[4], m[5]], v), dot3([m[6], m[7], m[8]], v)]
 }
 
 /// Row-major matrix times vector, plus a vector.
 #[inline(always)]
 pub(crate) fn mat_vec_add<S: Simd>(m: &Lane9<S>, v: Lane3<S>, b: Lane3<S>) -> Lane3<S> {
-    core::array::from_fn(|r| {
-        m[3 * r + 2].mul_add(v[2], m[3 * r + 1].mul_add(v[1], m[3 * r].mul_add(v[0], b[r])))
-    })
+    let mut out = b;
+    for r in 0..3 {
+        let last = m[3 * r].mul_add(v[0], b[r]);
+        out[r] = m[3 * r + 2].mul_add(v[2], m[3 * r + 1].mul_add(v[1], last));
+    }
+    out
 }
 
 /// Transpose of a row-major matrix times vector.
 #[inline(always)]
 pub(crate) fn mat_tr_vec<S: Simd>(m: &Lane9<S>, v: Lane3<S>) -> Lane3<S> {
-    core::array::from_fn(|c| dot3([m[c], m[3 + c], m[6 + c]], v))
+    [dot3([m[0], m[3], m[6]], v), dot3([m[1], m[4], m[7]], v), dot3([m[2], m[5], m[8]], v)]
 }
 
 /// Product of row-major matrices.
 #[inline(always)]
 pub(crate) fn mat_mul<S: Simd>(a: &Lane9<S>, b: &Lane9<S>) -> Lane9<S> {
-    core::array::from_fn(|k| {
-        let (r, c) = (k / 3, k % 3);
-        dot3([a[3 * r], a[3 * r + 1], a[3 * r + 2]], [b[c], b[3 + c], b[6 + c]])
-    })
+    let mut out = *b;
+    for r in 0..3 {
+        let row = [a[3 * r], a[3 * r + 1], a[3 * r + 2]];
+        for c in 0..3 {
+            out[3 * r + c] = dot3(row, [b[c], b[3 + c], b[6 + c]]);
+        }
+    }
+    out
 }
 
 /// Symmetric matrix (xx, yy, zz, xy, xz, yz) times vector.
@@ -563,8 +667,9 @@ mod tests {
     #[test]
     fn every_instruction_set_gives_the_same_lanes() {
         let quads = [Quad([1.0, 2.0, -3.0, 0.5]), Quad([4.0, 0.25, 2.0, 8.0])];
-        let expected = Instructions::Portable.dispatch(Sum(&quads));
-        assert_eq!(expected, Instructions::detect().dispatch(Sum(&quads)));
-        assert_eq!(expected[0].0, [3.0, -1.5, -3.0, 3.5]);
+        let best = Instructions::detect().unwrap().dispatch(Sum(&quads));
+        assert_eq!(best[0].0, [3.0, -1.5, -3.0, 3.5]);
+        #[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
+        assert_eq!(best, Instructions::Portable.dispatch(Sum(&quads)));
     }
 }

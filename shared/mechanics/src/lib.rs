@@ -75,6 +75,7 @@ pub mod mass_matrix;
 pub mod mass_matrix_factor;
 pub mod newton_direction;
 pub(crate) mod real;
+pub(crate) mod recursive_linearize;
 pub mod recursive_newton;
 pub mod reroot;
 pub mod row_matrix;

@@ -37,6 +37,8 @@ use crate::kinetic_hessian::KineticHessian;
 use crate::lanes::{Kernel, Simd, WideLane};
 use crate::mass_matrix_factor::MassMatrixFactor;
 use crate::newton_direction::{NewtonDirection, NewtonSolver};
+use crate::recursive_linearize::{AllColumns, ColumnSweeps};
+use crate::recursive_newton::RecursiveNewton;
 use crate::row_matrix::RowMatrix;
 use crate::spatial::{RigidTransform, Twist, Wrench};
 use crate::step::Integrator;
@@ -113,6 +115,8 @@ pub struct Linearizer {
     factor: MassMatrixFactor,
     velocities: [Vec<f64>; 2],
     tangent: TangentWorkspace,
+    /// Algorithm B.1 for whole steps: fixed base in momentum coordinates, without general wrenches.
+    recursive: Option<(RecursiveNewton, ColumnSweeps)>,
     column: Vec<f64>,
     momentum: Vec<f64>,
 }
@@ -135,6 +139,11 @@ impl Linearizer {
             InputHold::PerNode => tree.joint_count() * (s + 1),
         };
         let velocity = coordinates == StateCoordinates::Velocity;
+        let recursive = (!velocity && !tree.is_floating() && del.gains.is_empty()).then(|| {
+            let solver = RecursiveNewton::for_whole_step(tree, del);
+            let sweeps = ColumnSweeps::new(tree, solver.shape());
+            (solver, sweeps)
+        });
         Ok(Self {
             coordinates,
             hold,
@@ -147,6 +156,7 @@ impl Linearizer {
             factor: MassMatrixFactor::new(tree),
             velocities: [vec![0.0; n], vec![0.0; n]],
             tangent: TangentWorkspace::new(tree, del),
+            recursive,
             column: vec![0.0; s * n],
             momentum: vec![0.0; n],
         })
@@ -251,6 +261,29 @@ impl Linearizer {
             };
             out.add(n + i, last, del.rule.weights()[s] * del.time_step);
         }
+    }
+
+    /// The fast O(n²) path ([`crate::recursive_linearize`]): one factorisation by Algorithm B.1, two sweeps over sixteen columns at a
+    /// time. Fixed base in `(q, p)`, without drag, body wrenches and wrench laws.
+    ///
+    /// # Errors
+    /// [`StepError::Singular`] when the factorisation fails; [`ModelError::Unsupported`] outside its range.
+    pub fn linearize_by_recursion(
+        &mut self,
+        tree: &KinematicTree,
+        integrator: &mut Integrator,
+    ) -> Result<&LinearStep, StepError> {
+        let Some((solver, sweeps)) = &mut self.recursive else {
+            let reason = "the recursion over columns is for a fixed base in (q, p) without general wrenches";
+            return Err(ModelError::Unsupported { body: 0, reason }.into());
+        };
+        let del = integrator.del();
+        solver.factor(tree, del)?;
+        if let Some(responses) = solver.responses() {
+            let out = &mut self.step.matrix;
+            del.instructions.dispatch_wide(AllColumns { tree, del, hold: self.hold, responses, sweeps, out });
+        }
+        Ok(&self.step)
     }
 
     /// The strict O(n²) path: per column one Algorithm T, one solve, one Algorithm T. Fixed base in `(q, p)`, floating base in

@@ -36,7 +36,7 @@ use crate::errors::{ModelError, StepError};
 use crate::kinematics::{Configuration, Kinematics, Velocity};
 use crate::lanes::{
     Instructions, Kernel, Lane, Lane3, Lane6, Quad, Simd, add, bracket, cross, cross_add, dot6, dual_bracket,
-    halves, join, load, scale, scale_add, splat, store, sub, sym_vec,
+    halves, join, load, load_strided, scale, scale_add, splat, store, sub, sym_vec,
 };
 use crate::mass_matrix::{MassMatrixWorkspace, mass_matrix_into};
 use crate::mass_matrix_factor::MassMatrixFactor;
@@ -541,8 +541,7 @@ impl Kernel for MomentumTransport<'_> {
         let kinematics = &motion.kinematics;
         let zero = [Lane::splat(simd, 0.0); 6];
         if tree.is_floating() {
-            let eta: Lane6<S> =
-                core::array::from_fn(|k| Lane::load(simd, &base_twists.quads()[k * stride + quad]));
+            let eta: Lane6<S> = load_strided(simd, base_twists.quads(), quad, stride);
             let velocity = twist_lanes(simd, &kinematics.velocities_w()[0]);
             columns[0].eta = store(eta);
             columns[0].nu = store(bracket(velocity, eta));

@@ -132,7 +132,7 @@ pub(crate) fn jacobian_column_rule(
     tree: &KinematicTree,
     del: &DelWorkspace,
     hessian: &DelHessian,
-    mut put: impl FnMut(usize, usize, BaseEntry),
+    put: &mut dyn FnMut(usize, usize, BaseEntry),
 ) {
     let s = del.unknown_nodes();
     let start_twists = base_matrix(del, 0);

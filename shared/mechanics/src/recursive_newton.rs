@@ -47,48 +47,59 @@ use crate::dense_lu::DenseLu;
 use crate::errors::FactorError;
 use crate::kinetic_hessian::own_inertia;
 use crate::lanes::{
-    Instructions, Kernel, LANES, Lane, Lane3, Lane6, Quad, Simd, dot3, dual_bracket, load, splat, store,
+    Instructions, Kernel, LANES, Lane, Lane3, Lane6, Quad, Simd, dot3, dual_bracket, load, outer, splat,
+    store,
 };
 use crate::lobatto::MAX_UNKNOWN_NODES;
 use crate::newton_direction::{NewtonDirection, base_matrix, second_order_matrix};
+use crate::recursive_linearize::{BodyFactors, Responses};
 use crate::row_matrix::RowMatrix;
 use crate::small_inverse::invert;
 use crate::spatial::{Twist, Wrench};
 use crate::tree::{KinematicTree, NO_PARENT};
 
-const MAX_NODES: usize = MAX_UNKNOWN_NODES + 1;
+pub(crate) const MAX_NODES: usize = MAX_UNKNOWN_NODES + 1;
 
 /// Where the blocks of the interface vectors are.
 #[derive(Clone, Copy, Debug)]
-struct Interface {
-    s: usize,
+pub(crate) struct Interface {
+    pub s: usize,
     /// Rows of one `η` block: 3, or 6 with general wrenches.
-    eta: usize,
+    pub eta: usize,
     /// First node with a `DΓ` block: 1, or 0 with general wrenches.
-    first_impulse: usize,
+    pub first_impulse: usize,
+    /// Also `η^0` and `DΓ^s`, which the linearisation needs ([`crate::recursive_linearize`]); not with general wrenches.
+    pub whole_step: bool,
 }
 
 impl Interface {
-    fn inputs(&self) -> usize {
-        self.eta * (self.s - 1) + 6 * (self.s + 1)
-    }
-    fn outputs(&self) -> usize {
-        6 * (self.s + 1) + 6 * (self.s - self.first_impulse)
+    /// First node with an `η` block.
+    #[inline(always)]
+    fn first_eta(&self) -> usize {
+        usize::from(!self.whole_step)
     }
     #[inline(always)]
-    fn eta_at(&self, gamma: usize) -> usize {
-        self.eta * (gamma - 1)
+    pub fn inputs(&self) -> usize {
+        self.eta * (self.s - self.first_eta()) + 6 * (self.s + 1)
     }
     #[inline(always)]
-    fn nu_at(&self, beta: usize) -> usize {
-        self.eta * (self.s - 1) + 6 * beta
+    pub fn outputs(&self) -> usize {
+        6 * (self.s + 1) + 6 * (self.s + usize::from(self.whole_step) - self.first_impulse)
     }
     #[inline(always)]
-    fn momentum_at(&self, beta: usize) -> usize {
+    pub fn eta_at(&self, gamma: usize) -> usize {
+        self.eta * (gamma - self.first_eta())
+    }
+    #[inline(always)]
+    pub fn nu_at(&self, beta: usize) -> usize {
+        self.eta * (self.s - self.first_eta()) + 6 * beta
+    }
+    #[inline(always)]
+    pub fn momentum_at(&self, beta: usize) -> usize {
         6 * beta
     }
     #[inline(always)]
-    fn impulse_at(&self, alpha: usize) -> usize {
+    pub fn impulse_at(&self, alpha: usize) -> usize {
         6 * (self.s + 1) + 6 * (alpha - self.first_impulse)
     }
 }
@@ -119,6 +130,7 @@ pub struct RecursiveNewton {
     zero: Vec<Quad>,
     base: BaseRoot,
     column: Vec<f64>,
+    responses: Option<Responses>,
 }
 
 /// The root block of a floating tree.
@@ -136,7 +148,21 @@ impl RecursiveNewton {
     pub fn new(tree: &KinematicTree, del: &DelWorkspace) -> Self {
         let s = del.unknown_nodes();
         let general = !del.gains.is_empty();
-        let shape = Interface { s, eta: if general { 6 } else { 3 }, first_impulse: usize::from(!general) };
+        let (eta, first_impulse) = if general { (6, 0) } else { (3, 1) };
+        Self::with_interface(tree, del, Interface { s, eta, first_impulse, whole_step: false })
+    }
+
+    /// With the interface of the linearisation and its responses, for fixed trees without general wrenches.
+    pub(crate) fn for_whole_step(tree: &KinematicTree, del: &DelWorkspace) -> Self {
+        let s = del.unknown_nodes();
+        let shape = Interface { s, eta: 3, first_impulse: 1, whole_step: true };
+        let mut work = Self::with_interface(tree, del, shape);
+        work.responses = Some(Responses::new(tree, del, &shape));
+        work
+    }
+
+    fn with_interface(tree: &KinematicTree, del: &DelWorkspace, shape: Interface) -> Self {
+        let s = shape.s;
         let input_quads = shape.inputs().div_ceil(LANES);
         let output_quads = shape.outputs().div_ceil(LANES);
         let (slot_of, slot_count) = assign_slots(tree);
@@ -165,7 +191,17 @@ impl RecursiveNewton {
                 rhs: vec![0.0; base],
             },
             column: vec![0.0; s * tree.dof()],
+            responses: None,
         }
+    }
+
+    pub(crate) fn shape(&self) -> &Interface {
+        &self.shape
+    }
+
+    /// What the linearisation takes from the factorisation, for a workspace made for whole steps.
+    pub(crate) fn responses(&self) -> Option<&Responses> {
+        self.responses.as_ref()
     }
 
     /// The inverse pivot block `D_i⁻¹` of a body with a joint (s x s, row-major).
@@ -181,7 +217,7 @@ impl RecursiveNewton {
 }
 
 /// A slot for every body such that bodies whose `Y` is open at the same time differ.
-fn assign_slots(tree: &KinematicTree) -> (Vec<usize>, usize) {
+pub(crate) fn assign_slots(tree: &KinematicTree) -> (Vec<usize>, usize) {
     let n = tree.body_count();
     let mut slot_of = vec![usize::MAX; n];
     let mut free: Vec<usize> = Vec::new();
@@ -208,6 +244,9 @@ fn assign_slots(tree: &KinematicTree) -> (Vec<usize>, usize) {
 impl NewtonDirection for RecursiveNewton {
     fn factor(&mut self, tree: &KinematicTree, del: &DelWorkspace) -> Result<(), FactorError> {
         self.slots.fill(Quad::ZERO);
+        if let Some(responses) = &mut self.responses {
+            responses.clear();
+        }
         let instructions = self.instructions;
         instructions.dispatch(Factor { tree, del, work: self })?;
         if tree.is_floating() { self.factor_base(del) } else { Ok(()) }
@@ -243,12 +282,12 @@ impl NewtonDirection for RecursiveNewton {
 }
 
 /// What steps 3 to 6 need of a joint, node by node.
-struct JointNodes {
-    twist: [[f64; 6]; MAX_NODES],
-    rate: [[f64; 6]; MAX_NODES],
+pub(crate) struct JointNodes {
+    pub twist: [[f64; 6]; MAX_NODES],
+    pub rate: [[f64; 6]; MAX_NODES],
     /// `ad^D_μ S`, `ad^D_Γ S`.
-    turned_momentum: [[f64; 6]; MAX_NODES],
-    turned_impulse: [[f64; 6]; MAX_NODES],
+    pub turned_momentum: [[f64; 6]; MAX_NODES],
+    pub turned_impulse: [[f64; 6]; MAX_NODES],
 }
 
 struct Factor<'a> {
@@ -262,14 +301,18 @@ impl Kernel for Factor<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) -> Self::Output {
         // With constant arguments the loops over nodes and rows unroll (reduced interface: 12, 21 inputs).
-        let (s, eta) = (self.work.shape.s, self.work.shape.eta);
-        match (s, eta) {
-            (1, 3) if S::SPECIALISE => factor(simd, self, Interface { s: 1, eta: 3, first_impulse: 1 }),
-            (2, 3) if S::SPECIALISE => factor(simd, self, Interface { s: 2, eta: 3, first_impulse: 1 }),
-            _ => {
-                let shape = self.work.shape;
-                factor(simd, self, shape)
+        let shape = self.work.shape;
+        match (shape.s, shape.eta, shape.whole_step) {
+            (1, 3, false) if S::SPECIALISE => {
+                factor(simd, self, Interface { s: 1, eta: 3, first_impulse: 1, whole_step: false })
             }
+            (2, 3, false) if S::SPECIALISE => {
+                factor(simd, self, Interface { s: 2, eta: 3, first_impulse: 1, whole_step: false })
+            }
+            (2, 3, true) if S::SPECIALISE => {
+                factor(simd, self, Interface { s: 2, eta: 3, first_impulse: 1, whole_step: true })
+            }
+            _ => factor(simd, self, shape),
         }
     }
 }
@@ -286,7 +329,27 @@ fn factor<S: Simd>(simd: S, work: Factor<'_>, shape: Interface) -> Result<(), Fa
         }
         let nodes = joint_nodes(simd, del, i);
         joint_matrices(del, work, i, &nodes, &shape);
+        if shape.whole_step
+            && let Some(responses) = &mut work.responses
+        {
+            responses.add_fixed_directions(simd, tree, del, i);
+        }
         eliminate(simd, tree, del, work, i, &nodes, &shape)?;
+        if shape.whole_step
+            && let Some(responses) = &mut work.responses
+        {
+            let (ni, no) = (input_quads, shape.outputs().div_ceil(LANES));
+            let s = shape.s;
+            let factors = BodyFactors {
+                y: &work.slots[work.slot_of[i] * size..][..size],
+                b: &work.b[i * s * ni..][..s * ni],
+                w: &work.w[i * s * ni..][..s * ni],
+                c: &work.c[i * s * no..][..s * no],
+                u: &work.u[i * s * no..][..s * no],
+                inverse: &work.pivots[i * s * s..][..s * s],
+            };
+            responses.record(simd, tree, del, i, &nodes, &factors, &shape);
+        }
         let parent = tree.constants()[i].parent;
         let own = work.slot_of[i] * size;
         if parent != NO_PARENT {
@@ -386,9 +449,9 @@ fn own_response<S: Simd>(
 
 /// `x^ f^` of an arm and a force, row-major.
 #[inline(always)]
-fn arm_cross_force<S: Simd>(arm: Lane3<S>, force: Lane3<S>) -> [Lane<S>; 9] {
+pub(crate) fn arm_cross_force<S: Simd>(arm: Lane3<S>, force: Lane3<S>) -> [Lane<S>; 9] {
     let along = dot3(arm, force);
-    let mut product: [Lane<S>; 9] = core::array::from_fn(|k| force[k / 3] * arm[k % 3]);
+    let mut product = outer(force, arm);
     for k in 0..3 {
         product[4 * k] = product[4 * k] - along;
     }
@@ -502,7 +565,7 @@ fn joint_matrices(
 }
 
 #[inline(always)]
-fn dot<S: Simd>(simd: S, a: &[Quad], b: &[Quad]) -> f64 {
+pub(crate) fn dot<S: Simd>(simd: S, a: &[Quad], b: &[Quad]) -> f64 {
     let mut sum = Lane::splat(simd, 0.0);
     for (x, y) in a.iter().zip(b) {
         sum = Lane::load(simd, x).mul_add(Lane::load(simd, y), sum);
@@ -513,7 +576,7 @@ fn dot<S: Simd>(simd: S, a: &[Quad], b: &[Quad]) -> f64 {
 
 /// `target += factor source`.
 #[inline(always)]
-fn add_scaled<S: Simd>(simd: S, target: &mut [Quad], factor: f64, source: &[Quad]) {
+pub(crate) fn add_scaled<S: Simd>(simd: S, target: &mut [Quad], factor: f64, source: &[Quad]) {
     let factor = Lane::splat(simd, factor);
     for (t, x) in target.iter_mut().zip(source) {
         *t = factor.mul_add(Lane::load(simd, x), Lane::load(simd, t)).quad();
@@ -558,6 +621,15 @@ fn eliminate<S: Simd>(
             let at = shape.nu_at(alpha) + c;
             k[at / LANES].0[at % LANES] -= step * turned;
         }
+        if shape.whole_step
+            && alpha == 0
+            && let Some(responses) = &work.responses
+        {
+            for (c, change) in responses.fixed_direction_row(i, 0).into_iter().enumerate() {
+                let at = shape.eta_at(0) + c;
+                k[at / LANES].0[at % LANES] += change;
+            }
+        }
     }
 
     let constants = &tree.constants()[i];
@@ -593,6 +665,14 @@ fn eliminate<S: Simd>(
             subtract(shape.momentum_at(gamma) + k, nodes.turned_momentum[gamma][k]);
             if gamma < s {
                 subtract(shape.impulse_at(gamma) + k, nodes.turned_impulse[gamma][k]);
+            }
+        }
+        if shape.whole_step
+            && gamma == s
+            && let Some(responses) = &work.responses
+        {
+            for (k, change) in responses.moved_impulse(i, s).into_iter().enumerate() {
+                subtract(shape.impulse_at(s) + k, -change);
             }
         }
     }

@@ -40,8 +40,8 @@ use crate::floating_base::{
     second_order_rate,
 };
 use crate::lanes::{
-    Kernel, LANES, Lane, Lane3, Lane6, Quad, Simd, add, cross, dot6, dual_bracket, halves, join, load, scale,
-    scale_add, store, sub,
+    Kernel, LANES, Lane, Lane3, Lane6, Quad, Simd, add, cross, dot6, dual_bracket, halves, join, load,
+    load_strided, scale, scale_add, store, sub,
 };
 use crate::spatial::{Twist, Wrench};
 use crate::tree::{KinematicTree, NO_PARENT};
@@ -207,7 +207,7 @@ impl Kernel for SecondOrderAt<'_> {
         let (g, lane) = (self.alpha / LANES, self.alpha % LANES);
         let wrench: [f64; 6] = self.wrench.to_vector().into();
         let n = second_order(simd, &self.del.base[g], crate::lanes::splat(simd, &wrench));
-        let dq: Lane6<S> = core::array::from_fn(|k| Lane::load(simd, &self.dq[k * self.del.groups + g]));
+        let dq: Lane6<S> = load_strided(simd, &self.dq, g, self.del.groups);
         store(apply_second_order(&n, dq)).map(|q| q.0[lane])
     }
 }
@@ -256,8 +256,8 @@ fn base_variation<S: Simd>(simd: S, del: &DelWorkspace, work: &mut TangentWorksp
     let shift = base_twist(simd, &del.base[0], node_zero);
     let start: [f64; 6] = work.start.base_twist_w.to_vector().into();
     let rigid: Lane6<S> = core::array::from_fn(|k| Lane::splat(simd, start[k] - shift[k].quad().0[0]));
-    let dxi: Lane6<S> = core::array::from_fn(|k| Lane::load(simd, &work.dq[k * groups + g]));
-    let dxi_dot: Lane6<S> = core::array::from_fn(|k| Lane::load(simd, &work.dq_dot[k * groups + g]));
+    let dxi: Lane6<S> = load_strided(simd, &work.dq, g, groups);
+    let dxi_dot: Lane6<S> = load_strided(simd, &work.dq_dot, g, groups);
     let base = &del.base[g];
     let lanes = &mut work.bodies[g];
     lanes.eta = store(add(rigid, base_twist(simd, base, dxi)));
@@ -313,8 +313,9 @@ fn own_variations<S: Simd>(
         let mut change = dead_load_gain(position, weight, eta, false);
         if let Some(gain) = del.gains.get(at) {
             for r in 0..6 {
-                let row = |m: &[Quad; 36]| core::array::from_fn(|c| Lane::load(simd, &m[6 * r + c]));
-                change[r] = change[r] + dot6(row(&gain.eta), eta) + dot6(row(&gain.nu), nu);
+                change[r] = change[r]
+                    + dot6(load_strided(simd, &gain.eta, 6 * r, 1), eta)
+                    + dot6(load_strided(simd, &gain.nu, 6 * r, 1), nu);
             }
         }
         let step = Lane::load(simd, &del.weights[g]);
@@ -390,15 +391,15 @@ fn base_rows<S: Simd>(simd: S, del: &DelWorkspace, work: &mut TangentWorkspace) 
     let s = work.s;
     for g in 0..groups {
         let (base, body, lanes) = (&del.base[g], &del.bodies[g], &work.bodies[g]);
-        let dxi: Lane6<S> = core::array::from_fn(|k| Lane::load(simd, &work.dq[k * groups + g]));
+        let dxi: Lane6<S> = load_strided(simd, &work.dq, g, groups);
         let curved = apply_second_order(&second_order(simd, base, load(simd, &body.momentum)), dxi);
         let projected = base_project(simd, base, load(simd, &lanes.d_momentum));
         work.projections[g] = store(add(projected, curved));
     }
     for g in 0..groups {
         let (base, body, lanes) = (&del.base[g], &del.bodies[g], &work.bodies[g]);
-        let dxi: Lane6<S> = core::array::from_fn(|k| Lane::load(simd, &work.dq[k * groups + g]));
-        let dxi_dot: Lane6<S> = core::array::from_fn(|k| Lane::load(simd, &work.dq_dot[k * groups + g]));
+        let dxi: Lane6<S> = load_strided(simd, &work.dq, g, groups);
+        let dxi_dot: Lane6<S> = load_strided(simd, &work.dq_dot, g, groups);
         let momentum: Lane6<S> = load(simd, &body.momentum);
         let impulse: Lane6<S> = load(simd, &body.impulse);
         let mut held = base_project(simd, base, dual_bracket(momentum, load(simd, &lanes.nu)));

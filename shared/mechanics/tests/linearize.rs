@@ -3,6 +3,7 @@
 
 mod oracle;
 
+use delmpc_mechanics::errors::StepError;
 use delmpc_mechanics::linearize::{InputHold, LinearStep, Linearizer, StateCoordinates};
 use delmpc_mechanics::lobatto::LobattoRule;
 use delmpc_mechanics::newton_direction::NewtonMethod;
@@ -60,6 +61,7 @@ fn symplectic_defect(a: &[f64], n: usize) -> f64 {
 
 #[test]
 fn a_and_b_match_the_vectors_by_every_path() {
+    let mut recursions = 0;
     for case in unconstrained() {
         let stored = &case.json["linearisation"];
         for method in METHODS {
@@ -77,6 +79,14 @@ fn a_and_b_match_the_vectors_by_every_path() {
                 let step = work.linearize_by_tangent(&case.tree, &mut integrator).unwrap();
                 assert_close(&format!("{name} A by tangent"), &a(step), &want_a, TOLERANCE);
                 assert_close(&format!("{name} {key} by tangent"), &b(step), &want_b, TOLERANCE);
+                match work.linearize_by_recursion(&case.tree, &mut integrator) {
+                    Ok(step) => {
+                        assert_close(&format!("{name} A by recursion"), &a(step), &want_a, TOLERANCE);
+                        assert_close(&format!("{name} {key} by recursion"), &b(step), &want_b, TOLERANCE);
+                        recursions += 1;
+                    }
+                    Err(error) => assert!(matches!(error, StepError::Argument(_)), "{name}: {error}"),
+                }
             }
             if let Some(want_a) = stored.get("A_qqd").map(flat) {
                 let coordinates = StateCoordinates::Velocity;
@@ -88,6 +98,7 @@ fn a_and_b_match_the_vectors_by_every_path() {
             }
         }
     }
+    assert!(recursions >= 20, "only {recursions} cases by recursion");
 }
 
 #[test]
