@@ -262,6 +262,8 @@ uint32 verdict
 uint32 fallback_level
 uint32 reason
 float64[32] torque
+float64[32] torque_lower
+float64[32] torque_upper
 float64[32] position_ref
 float64[32] velocity_ref
 float64[2048] gain
@@ -402,6 +404,8 @@ mod tests {
                 fallback_level,
                 reason,
                 torque,
+                torque_lower,
+                torque_upper,
                 position_ref,
                 velocity_ref,
                 gain,

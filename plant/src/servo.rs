@@ -19,11 +19,15 @@ use delmpc_messages::{Command, FallbackLevel, MAX_JOINTS, MessageError, Verdict}
 
 use crate::error::{PlantError, require, require_length};
 
-/// `u = torque + gain [q - position_ref; q̇ - velocity_ref]`.
+/// `u = torque + gain [q - position_ref; q̇ - velocity_ref]` between `lower` and `upper`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AffineLaw {
     /// Feed-forward torque.
     pub torque: Vec<f64>,
+    /// Least torques.
+    pub lower: Vec<f64>,
+    /// Largest torques.
+    pub upper: Vec<f64>,
     /// Reference positions.
     pub position_ref: Vec<f64>,
     /// Reference velocities.
@@ -33,11 +37,13 @@ pub struct AffineLaw {
 }
 
 impl AffineLaw {
-    /// Zero torque at zero.
+    /// Zero torque at zero, without bounds.
     pub fn zeros(joints: usize) -> Self {
         let zero = vec![0.0; joints];
         Self {
             torque: zero.clone(),
+            lower: vec![f64::NEG_INFINITY; joints],
+            upper: vec![f64::INFINITY; joints],
             position_ref: zero.clone(),
             velocity_ref: zero,
             gain: vec![0.0; 2 * joints * joints],
@@ -67,13 +73,15 @@ impl AffineLaw {
                 sum += row[j] * (position[j] - self.position_ref[j]);
                 sum += row[n + j] * (velocity[j] - self.velocity_ref[j]);
             }
-            *out = sum;
+            *out = sum.max(self.lower[i]).min(self.upper[i]);
         }
     }
 
     fn load(&mut self, command: &Command) {
         let n = self.torque.len();
         self.torque.copy_from_slice(&command.torque[..n]);
+        self.lower.copy_from_slice(&command.torque_lower[..n]);
+        self.upper.copy_from_slice(&command.torque_upper[..n]);
         self.position_ref.copy_from_slice(&command.position_ref[..n]);
         self.velocity_ref.copy_from_slice(&command.velocity_ref[..n]);
         for (i, row) in self.gain.chunks_exact_mut(2 * n).enumerate() {
@@ -83,7 +91,7 @@ impl AffineLaw {
     }
 
     fn check(&self, joints: usize) -> Result<(), PlantError> {
-        for list in [&self.torque, &self.position_ref, &self.velocity_ref] {
+        for list in [&self.torque, &self.lower, &self.upper, &self.position_ref, &self.velocity_ref] {
             require_length("static law", list.len(), joints)?;
         }
         require_length("gain of the static law", self.gain.len(), 2 * joints * joints)

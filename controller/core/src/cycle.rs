@@ -15,7 +15,9 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use delmpc_mechanics::inverse_dynamics::{InverseDynamicsWorkspace, gravity_force_into};
-use delmpc_messages::{Command, CycleReport, FallbackLevel, MAX_JOINTS, PlantState, Verdict};
+use delmpc_messages::{
+    Command, ConstraintKind, CycleReport, FallbackLevel, LARGEST_EFFORT, MAX_JOINTS, PlantState, Verdict,
+};
 use faer::{Mat, MatRef};
 use nalgebra::Vector3;
 
@@ -88,17 +90,20 @@ impl Clock for StoppedClock {
     }
 }
 
-/// A law the command can carry: `u = torque + gain (x - reference)`, in the order of the tree.
+/// A law the command can carry: `u = torque + gain (x - reference)` between bounds, in the order of the tree.
 #[derive(Clone, Debug)]
 struct Law {
     torque: Vec<f64>,
+    lower: Vec<f64>,
+    upper: Vec<f64>,
     reference: Vec<f64>,
     gain: Mat<f64>,
 }
 
 impl Law {
     fn new(n: usize) -> Self {
-        Self { torque: vec![0.0; n], reference: vec![0.0; 2 * n], gain: Mat::zeros(n, 2 * n) }
+        let (lower, upper) = (vec![0.0; n], vec![0.0; n]);
+        Self { torque: vec![0.0; n], lower, upper, reference: vec![0.0; 2 * n], gain: Mat::zeros(n, 2 * n) }
     }
 
     fn torque_at(&self, x: &[f64], error: &mut [f64], torque: &mut [f64]) {
@@ -107,6 +112,9 @@ impl Law {
         }
         torque.copy_from_slice(&self.torque);
         gemv(torque, faer::Accum::Add, self.gain.as_ref(), error, 1.0);
+        for ((u, lower), upper) in torque.iter_mut().zip(&self.lower).zip(&self.upper) {
+            *u = u.max(*lower).min(*upper);
+        }
     }
 }
 
@@ -356,9 +364,6 @@ impl Controller {
         let (torque, _) = rest.split_at_mut(n);
         for _ in 0..steps as usize {
             self.law.torque_at(&self.predicted, error, torque);
-            for (u, limit) in torque.iter_mut().zip(&self.model.limits) {
-                *u = u.clamp(-limit.effort, limit.effort);
-            }
             let tree = &self.model.tree;
             self.dynamics.simulate(tree, &self.predicted, torque, time_step, error).map_err(|_| ())?;
             self.predicted.copy_from_slice(error);
@@ -480,7 +485,6 @@ impl Controller {
         let n = self.model.tree.dof();
         let largest = |k: usize| crate::kernels::largest(&self.solution.x.col_as_slice(k)[..n]);
         if (0..=self.lengths.len()).any(|k| largest(k) > LARGEST_MOVE) {
-            self.has_plan = false;
             return Err(reason::FAR);
         }
         self.nominal.add(&self.solution);
@@ -548,6 +552,10 @@ impl Controller {
     fn form_law(&mut self, level: FallbackLevel, time_s: f64) {
         let n = self.model.tree.dof();
         let law = &mut self.law;
+        for (j, limit) in self.model.limits.iter().enumerate() {
+            let effort = limit.effort.min(LARGEST_EFFORT);
+            (law.lower[j], law.upper[j]) = (-effort, effort);
+        }
         let effective = match (self.config.kind, level) {
             (ControllerKind::Off, _) => FallbackLevel::ZeroTorque,
             (ControllerKind::StaticLqr, FallbackLevel::FreshSolution | FallbackLevel::ShiftedPlan) => {
@@ -562,6 +570,10 @@ impl Controller {
                 // The law holds for a period: its reference is the plan's state half a period on.
                 self.plan.state_at(time_s + 0.5 * self.config.period_s, &mut law.reference);
                 law.gain.copy_from(self.riccati.gain(stage));
+                if level == FallbackLevel::FreshSolution {
+                    let planned = (self.solution.u.as_ref(), self.solution.x.as_ref());
+                    bound_by_pressure_point(&self.problem.stages[stage], stage, planned, law);
+                }
             }
             FallbackLevel::StaticLqr => {
                 law.torque.copy_from_slice(&self.static_law.torque);
@@ -593,8 +605,8 @@ impl Controller {
                 }
             }
         }
-        for (u, limit) in law.torque.iter_mut().zip(&self.model.limits) {
-            *u = u.clamp(-limit.effort, limit.effort);
+        for (j, u) in law.torque.iter_mut().enumerate() {
+            *u = u.max(law.lower[j]).min(law.upper[j]);
         }
     }
 
@@ -711,6 +723,38 @@ const LEVELS: [FallbackLevel; 6] = [
     FallbackLevel::ZeroTorque,
 ];
 
+/// Keeps what the feedback adds between two cycles from driving the pressure point over the edge of the sole.
+///
+/// A row `g'u + .. <= bound` of the pressure point has a slack in the plan; the joint that moves it most, an ankle, may use up that
+/// slack and no more. A push acts on the state, not on the torque of the ankle, so this holds while the robot is being pushed.
+fn bound_by_pressure_point(
+    stage: &LqStage,
+    index: usize,
+    (u, x): (MatRef<'_, f64>, MatRef<'_, f64>),
+    law: &mut Law,
+) {
+    let n = law.torque.len();
+    for row in 0..stage.row_count {
+        if stage.row_tag[row].kind != ConstraintKind::CentreOfPressure {
+            continue;
+        }
+        let coefficients = stage.rows.col_as_slice(row);
+        let by_input = (0..n).map(|j| coefficients[j] * u[(j, index)]);
+        let by_state = (0..2 * n).map(|i| coefficients[n + i] * x[(i, index)]);
+        let slack = (stage.row_bound[row] - by_input.sum::<f64>() - by_state.sum::<f64>()).max(0.0);
+        let largest = (0..n).max_by(|a, b| coefficients[*a].abs().total_cmp(&coefficients[*b].abs()));
+        if let Some(j) = largest.filter(|j| coefficients[*j].abs() > f64::EPSILON) {
+            let room = slack / coefficients[j];
+            let (planned, lower, upper) = (law.torque[j], &mut law.lower[j], &mut law.upper[j]);
+            if room >= 0.0 && coefficients[j] > 0.0 {
+                *upper = upper.min(planned + room).max(*lower);
+            } else {
+                *lower = lower.max(planned + room).min(*upper);
+            }
+        }
+    }
+}
+
 /// Torque limits as bounds on the deviation from the nominal torque.
 fn bound_inputs(model: &ControllerModel, fraction: f64, nominal: &[f64], stage: &mut LqStage) {
     for (j, limit) in model.limits.iter().enumerate() {
@@ -735,6 +779,8 @@ fn write_law(law: &Law, message_joint: &[usize], command: &mut Command) {
     let n = message_joint.len();
     for (i, &joint) in message_joint.iter().enumerate() {
         command.torque[joint] = law.torque[i];
+        command.torque_lower[joint] = law.lower[i];
+        command.torque_upper[joint] = law.upper[i];
         command.position_ref[joint] = law.reference[i];
         command.velocity_ref[joint] = law.reference[n + i];
         for (j, &column) in message_joint.iter().enumerate() {

@@ -87,17 +87,14 @@ macro_rules! wide_as_two_lanes {
 }
 
 /// Plain arrays: what every processor can do.
-#[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Portable;
 
-#[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
 #[inline(always)]
 fn zip(a: [f64; 4], b: [f64; 4], f: impl Fn(f64, f64) -> f64) -> [f64; 4] {
     [f(a[0], b[0]), f(a[1], b[1]), f(a[2], b[2]), f(a[3], b[3])]
 }
 
-#[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
 impl Simd for Portable {
     const SPECIALISE: bool = false;
     wide_as_two_lanes!();

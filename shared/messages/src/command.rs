@@ -12,10 +12,12 @@ use crate::{
 
 /// The answer to one [`crate::PlantState`]: an affine feedback law with a time span in which it holds.
 ///
-/// The plant applies, at its own rate, `u = torque + gain [q - q_ref; q_dot - q_dot_ref]` ([`Self::torque_into`]), then its limits.
+/// The plant applies, at its own rate, `u = torque + gain [q - q_ref; q_dot - q_dot_ref]` between `torque_lower` and `torque_upper`
+/// ([`Self::torque_into`]), then its limits. The bounds keep what the feedback adds between two commands within what the controller
+/// found admissible: those of the stance ankle keep the pressure point in the sole while the robot is being pushed.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
-#[cfg_attr(feature = "shared_memory", derive(ZeroCopySend), type_name("delmpc/Command/v1"))]
+#[cfg_attr(feature = "shared_memory", derive(ZeroCopySend), type_name("delmpc/Command/v2"))]
 pub struct Command {
     /// Type, joint set, run, sequence.
     pub header: Header,
@@ -37,6 +39,10 @@ pub struct Command {
     pub reason: u32,
     /// Feed-forward joint torque at the reference point (N m or N).
     pub torque: [f64; MAX_JOINTS],
+    /// Least joint torque (N m or N).
+    pub torque_lower: [f64; MAX_JOINTS],
+    /// Largest joint torque (N m or N).
+    pub torque_upper: [f64; MAX_JOINTS],
     /// Reference joint position (rad or m).
     pub position_ref: [f64; MAX_JOINTS],
     /// Reference joint velocity (rad/s or m/s).
@@ -48,7 +54,7 @@ pub struct Command {
     pub report: CycleReport,
 }
 
-message!(Command, "delmpc/Command/v1", b"DMCO", 1);
+message!(Command, "delmpc/Command/v2", b"DMCO", 2);
 
 /// Outcome of a control cycle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -110,12 +116,14 @@ impl FallbackLevel {
 }
 
 impl Command {
-    /// A command of zero torque and zero gain, with sequence 0, on the last rung of the ladder, valid at no time.
+    /// A command of zero torque and zero gain without bounds, with sequence 0, on the last rung of the ladder, valid at no time.
     pub fn new(run_id: u64, joint_set_hash: u64, n_joints: u32) -> Self {
         Self {
             header: Header::new::<Self>(run_id, joint_set_hash),
             n_joints,
             fallback_level: FallbackLevel::ZeroTorque as u32,
+            torque_lower: [-LARGEST_EFFORT; MAX_JOINTS],
+            torque_upper: [LARGEST_EFFORT; MAX_JOINTS],
             ..Self::zeroed()
         }
     }
@@ -139,6 +147,13 @@ impl Command {
         }
 
         check::plausible(message, "torque", &self.torque[..n], LARGEST_EFFORT)?;
+        check::plausible(message, "torque_lower", &self.torque_lower[..n], LARGEST_EFFORT)?;
+        check::plausible(message, "torque_upper", &self.torque_upper[..n], LARGEST_EFFORT)?;
+        for (index, (lower, upper)) in self.torque_lower[..n].iter().zip(&self.torque_upper).enumerate() {
+            if lower > upper {
+                return Err(MessageError::EmptyBounds { message, index, lower: *lower, upper: *upper });
+            }
+        }
         check::plausible(message, "position_ref", &self.position_ref[..n], LARGEST_COORDINATE)?;
         check::plausible(message, "velocity_ref", &self.velocity_ref[..n], LARGEST_COORDINATE)?;
         for (row, gain) in self.gain[..n].iter().enumerate() {
@@ -170,7 +185,7 @@ impl Command {
         (self.valid_from_ns..self.valid_until_ns).contains(&plant_time_ns)
     }
 
-    /// The torque of the feedback law at a measured state, without limits: `u = torque + gain [q - q_ref; q_dot - q_dot_ref]`.
+    /// The torque of the feedback law at a measured state: `u = torque + gain [q - q_ref; q_dot - q_dot_ref]` within its bounds.
     ///
     /// Cost: O(n²), no allocation. Call it on a validated command.
     ///
@@ -197,6 +212,7 @@ impl Command {
                 *torque += position_gain[j] * (position[j] - self.position_ref[j]);
                 *torque += velocity_gain[j] * (velocity[j] - self.velocity_ref[j]);
             }
+            *torque = torque.max(self.torque_lower[i]).min(self.torque_upper[i]);
         }
         Ok(())
     }

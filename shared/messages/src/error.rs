@@ -118,6 +118,21 @@ pub enum MessageError {
         /// End of the interval.
         until_ns: u64,
     },
+    /// Bounds with nothing between them.
+    #[error(
+        "{message}: torque_lower[{index}] = {lower:e} is above torque_upper[{index}] = {upper:e}; look at the sender, nothing was \
+         taken over from this message"
+    )]
+    EmptyBounds {
+        /// The refused message.
+        message: &'static str,
+        /// The joint.
+        index: usize,
+        /// The lower bound.
+        lower: f64,
+        /// The upper bound.
+        upper: f64,
+    },
     /// A slice handed in by the caller has another length than the message has joints.
     #[error(
         "{message}: argument {argument} has length {found}, expected {expected}, the joints of this message"
@@ -148,6 +163,7 @@ impl MessageError {
             Self::UnknownCode { .. } => 8,
             Self::EmptyInterval { .. } => 9,
             Self::WrongLength { .. } => 10,
+            Self::EmptyBounds { .. } => 11,
         }
     }
 }

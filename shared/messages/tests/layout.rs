@@ -42,9 +42,9 @@ fn plant_state_v1() {
 }
 
 #[test]
-fn command_v1() {
-    assert_eq!(Command::VERSION, 1);
-    assert_eq!((size_of::<Command>(), align_of::<Command>()), (17_336, 8));
+fn command_v2() {
+    assert_eq!(Command::VERSION, 2);
+    assert_eq!((size_of::<Command>(), align_of::<Command>()), (17_848, 8));
     assert_eq!(offset_of!(Command, header), 0);
     assert_eq!(offset_of!(Command, state_sequence), 40);
     assert_eq!(offset_of!(Command, state_time_ns), 48);
@@ -55,10 +55,12 @@ fn command_v1() {
     assert_eq!(offset_of!(Command, fallback_level), 80);
     assert_eq!(offset_of!(Command, reason), 84);
     assert_eq!(offset_of!(Command, torque), 88);
-    assert_eq!(offset_of!(Command, position_ref), 344);
-    assert_eq!(offset_of!(Command, velocity_ref), 600);
-    assert_eq!(offset_of!(Command, gain), 856);
-    assert_eq!(offset_of!(Command, report), 17_240);
+    assert_eq!(offset_of!(Command, torque_lower), 344);
+    assert_eq!(offset_of!(Command, torque_upper), 600);
+    assert_eq!(offset_of!(Command, position_ref), 856);
+    assert_eq!(offset_of!(Command, velocity_ref), 1112);
+    assert_eq!(offset_of!(Command, gain), 1368);
+    assert_eq!(offset_of!(Command, report), 17_752);
 }
 
 #[test]

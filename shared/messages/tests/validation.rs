@@ -131,8 +131,10 @@ fn every_number_of_a_state_is_checked_by_name_and_index() {
 
 #[test]
 fn every_number_of_a_command_is_checked_by_name_and_index() {
-    let fields: [CommandField; 3] = [
+    let fields: [CommandField; 5] = [
         ("torque", |c| &mut c.torque),
+        ("torque_lower", |c| &mut c.torque_lower),
+        ("torque_upper", |c| &mut c.torque_upper),
         ("position_ref", |c| &mut c.position_ref),
         ("velocity_ref", |c| &mut c.velocity_ref),
     ];

@@ -52,6 +52,8 @@ impl Corrupt for Command {
         let (position_gain, velocity_gain) = self.gain[row].split_at_mut(MAX_JOINTS);
         let numbers = [
             &mut self.torque[..n],
+            &mut self.torque_lower[..n],
+            &mut self.torque_upper[..n],
             &mut self.position_ref[..n],
             &mut self.velocity_ref[..n],
             &mut position_gain[..n],
