@@ -1,6 +1,7 @@
 //! Algorithms 2 and 3 of a vector of stages: the 3 x 3 blocks of every pair on a branch and the right-hand sides.
 
 use super::memory::{Batch, END, START, Scratch};
+use super::nodes::split;
 use super::{DERIVATIVE, NODES, Plan, WEIGHTS};
 use crate::stage_lanes::{
     StageKernel, StageMemory, StageSimd, Stages, Stages3, Stages6, cross, dot3, dot6, halves, load, splat,
@@ -46,13 +47,12 @@ impl<M: StageMemory> StageKernel<M> for Assemble<'_, M> {
 
 #[inline(always)]
 fn node_terms<S: StageSimd>(simd: S, plan: &Plan, scratch: &mut Scratch<S::Memory>, i: usize, alpha: usize) {
-    let (poses, motions) = (&scratch.poses[alpha], &scratch.motions[alpha]);
-    let a: Stages6<S> = load(simd, &poses[i].a);
-    let b: Stages6<S> = load(simd, &motions[i].b);
+    let a: Stages6<S> = load(simd, &scratch.poses[alpha][i].a);
+    let b: Stages6<S> = load(simd, &scratch.motions[alpha][i].b);
+    let screws = &scratch.screws[alpha];
     let c: Stages3<S> = cross(halves(a).1, splat(simd, &plan.gravity));
     for (&j, terms) in plan.tree.branch(i).iter().zip(&mut scratch.terms) {
-        let twist: Stages6<S> = load(simd, &poses[j as usize].twist);
-        let rate: Stages6<S> = load(simd, &motions[j as usize].twist_rate);
+        let (twist, rate) = split(simd, &screws[j as usize]);
         let at = 4 * alpha;
         terms[at + MASS] = dot6(twist, a).store();
         terms[at + COLUMN] = dot6(rate, a).store();
@@ -77,12 +77,13 @@ fn end_terms<S: StageSimd>(
     node: usize,
     at: usize,
 ) {
-    let (poses, motions) = (&scratch.poses[node], &scratch.motions[motion]);
-    let a: Stages6<S> = load(simd, &poses[i].a);
-    let b: Stages6<S> = load(simd, &motions[i].b);
+    let a: Stages6<S> = load(simd, &scratch.poses[node][i].a);
+    let b: Stages6<S> = load(simd, &scratch.motions[motion][i].b);
+    let screws = &scratch.screws[motion];
     for (&j, terms) in plan.tree.branch(i).iter().zip(&mut scratch.terms) {
-        terms[at] = dot6(load(simd, &motions[j as usize].twist_rate), a).store();
-        terms[at + 1] = dot6(load(simd, &poses[j as usize].twist), b).store();
+        let (twist, rate) = split(simd, &screws[j as usize]);
+        terms[at] = dot6(rate, a).store();
+        terms[at + 1] = dot6(twist, b).store();
     }
 }
 

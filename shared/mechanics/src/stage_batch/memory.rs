@@ -92,8 +92,6 @@ pub(crate) struct Pose<M> {
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Motion<M> {
     pub velocity: [M; 6],
-    /// `Ṡ`.
-    pub twist_rate: [M; 6],
     /// `μ`.
     pub momentum: [M; 6],
     /// `B = 𝓜 Ṡ - ad^D_μ S`.
@@ -121,6 +119,8 @@ pub(crate) type BackwardPanel<M> = [M; 7];
 pub(crate) struct Scratch<M> {
     pub poses: [Vec<Pose<M>>; NODES],
     pub motions: [Vec<Motion<M>>; MOTIONS],
+    /// `S` and `Ṡ`, side by side: the pairs read them again and again.
+    pub screws: [Vec<[M; 12]>; MOTIONS],
     pub rates: [Vec<M>; MOTIONS],
     /// `p^2` at the nodes.
     pub end_momentum: Vec<M>,
@@ -132,6 +132,8 @@ pub(crate) struct Scratch<M> {
     pub sides: Vec<[M; 7]>,
     /// Block of columns that is being solved: `[(joint 3 + row) columns + column]`.
     pub columns: Vec<M>,
+    /// One column, stage by stage: squares of positions and of rates in turn.
+    pub transposed: Vec<M>,
 }
 
 impl<M: StageMemory> Scratch<M> {
@@ -140,6 +142,7 @@ impl<M: StageMemory> Scratch<M> {
         Self {
             poses: core::array::from_fn(|_| vec![Pose::default(); n]),
             motions: core::array::from_fn(|_| vec![Motion::default(); n]),
+            screws: core::array::from_fn(|_| vec![[M::default(); 12]; n]),
             rates: core::array::from_fn(|_| zeros()),
             end_momentum: zeros(),
             terms: vec![[M::default(); 16]; depth],
@@ -147,6 +150,7 @@ impl<M: StageMemory> Scratch<M> {
             backward: vec![[M::default(); 7]; pairs],
             sides: vec![[M::default(); 7]; pairs],
             columns: vec![M::default(); 3 * n * columns],
+            transposed: vec![M::default(); 2 * n.next_multiple_of(M::COUNT)],
         }
     }
 }

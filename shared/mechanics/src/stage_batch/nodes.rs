@@ -158,6 +158,7 @@ fn times<S: StageSimd>(simd: S, mass: f64, inertia: &[Stages<S>; 9], x: Stages6<
 fn motion<S: StageSimd>(simd: S, plan: &Plan, scratch: &mut Scratch<S::Memory>, v: usize) {
     let poses = &scratch.poses[NODE_OF[v]];
     let motions = &mut scratch.motions[v];
+    let screws = &mut scratch.screws[v];
     let zero = [Stages::splat(simd, 0.0); 6];
     for (i, constants) in plan.tree.constants().iter().enumerate() {
         let twist: Stages6<S> = load(simd, &poses[i].twist);
@@ -173,7 +174,7 @@ fn motion<S: StageSimd>(simd: S, plan: &Plan, scratch: &mut Scratch<S::Memory>, 
         let momentum = times(simd, constants.mass, &load(simd, &poses[i].own), velocity);
         let motion = &mut motions[i];
         store(&mut motion.velocity, velocity);
-        store(&mut motion.twist_rate, twist_rate);
+        store(&mut screws[i], both(twist, twist_rate));
         store(&mut motion.momentum, momentum);
     }
     for i in (0..plan.n).rev() {
@@ -183,15 +184,25 @@ fn motion<S: StageSimd>(simd: S, plan: &Plan, scratch: &mut Scratch<S::Memory>, 
             let target = &mut motions[constants.parent].momentum;
             store(target, add(load(simd, target), momentum));
         }
-        let moved = times(
-            simd,
-            constants.subtree_mass,
-            &load(simd, &poses[i].composite),
-            load(simd, &motions[i].twist_rate),
-        );
-        let bracket = dual_bracket(momentum, load(simd, &poses[i].twist));
+        let (twist, twist_rate) = split(simd, &screws[i]);
+        let moved = times(simd, constants.subtree_mass, &load(simd, &poses[i].composite), twist_rate);
+        let bracket = dual_bracket(momentum, twist);
         store(&mut motions[i].b, sub(moved, bracket));
     }
+}
+
+/// `S` and `Ṡ` side by side.
+#[inline(always)]
+fn both<S: StageSimd>(twist: Stages6<S>, rate: Stages6<S>) -> [Stages<S>; 12] {
+    let ([a, b, c, d, e, f], [g, h, i, j, k, l]) = (twist, rate);
+    [a, b, c, d, e, f, g, h, i, j, k, l]
+}
+
+/// `S` and `Ṡ` from side by side.
+#[inline(always)]
+pub(super) fn split<S: StageSimd>(simd: S, screws: &[S::Memory; 12]) -> (Stages6<S>, Stages6<S>) {
+    let [a, b, c, d, e, f, g, h, i, j, k, l] = load(simd, screws);
+    ([a, b, c, d, e, f], [g, h, i, j, k, l])
 }
 
 /// The rows `r^0, r^1` and `p^2`.
@@ -207,7 +218,8 @@ fn rows<S: StageSimd>(simd: S, plan: &Plan, batch: &mut Batch<S::Memory>, scratc
         for beta in 0..NODES {
             let (pose, motion) = (&scratch.poses[beta][i], &scratch.motions[beta][i]);
             let momentum = load(simd, &motion.momentum);
-            let projected = dot6(load(simd, &pose.twist), momentum);
+            let (twist, twist_rate) = split(simd, &scratch.screws[beta][i]);
+            let projected = dot6(twist, momentum);
             for alpha in 0..NODES {
                 let weight = Stages::splat(simd, WEIGHTS[beta] * DERIVATIVE[beta][alpha]);
                 rows[alpha] = projected.mul_add(weight, rows[alpha]);
@@ -217,7 +229,7 @@ fn rows<S: StageSimd>(simd: S, plan: &Plan, batch: &mut Batch<S::Memory>, scratc
             let mut force = Stages::splat(simd, constants.damping).neg_mul_add(rate, held);
             force = Stages::splat(simd, constants.stiffness).neg_mul_add(stretch, force);
             force = force + dot3(halves(load(simd, &pose.a)).1, gravity);
-            force = force + dot6(load(simd, &motion.twist_rate), momentum);
+            force = force + dot6(twist_rate, momentum);
             rows[beta] = step.times(WEIGHTS[beta]).mul_add(force, rows[beta]);
         }
         store(&mut batch.residual[i], [rows[0], rows[1]]);
