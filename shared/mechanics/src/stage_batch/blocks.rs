@@ -1,7 +1,6 @@
 //! Algorithms 2 and 3 of a vector of stages: the 3 x 3 blocks of every pair on a branch and the right-hand sides.
 
 use super::memory::{Batch, END, START, Scratch};
-use super::nodes::split;
 use super::{DERIVATIVE, NODES, Plan, WEIGHTS};
 use crate::stage_lanes::{
     StageKernel, StageMemory, StageSimd, Stages, Stages3, Stages6, cross, dot3, dot6, halves, load, splat,
@@ -47,12 +46,13 @@ impl<M: StageMemory> StageKernel<M> for Assemble<'_, M> {
 
 #[inline(always)]
 fn node_terms<S: StageSimd>(simd: S, plan: &Plan, scratch: &mut Scratch<S::Memory>, i: usize, alpha: usize) {
-    let a: Stages6<S> = load(simd, &scratch.poses[alpha][i].a);
-    let b: Stages6<S> = load(simd, &scratch.motions[alpha][i].b);
-    let screws = &scratch.screws[alpha];
+    let a: Stages6<S> = load(simd, &scratch.a[alpha][i]);
+    let b: Stages6<S> = load(simd, &scratch.b[alpha][i]);
+    let (twists, rates) = (&scratch.twists[alpha], &scratch.twist_rates[alpha]);
     let c: Stages3<S> = cross(halves(a).1, splat(simd, &plan.gravity));
     for (&j, terms) in plan.tree.branch(i).iter().zip(&mut scratch.terms) {
-        let (twist, rate) = split(simd, &screws[j as usize]);
+        let twist: Stages6<S> = load(simd, &twists[j as usize]);
+        let rate: Stages6<S> = load(simd, &rates[j as usize]);
         let at = 4 * alpha;
         terms[at + MASS] = dot6(twist, a).store();
         terms[at + COLUMN] = dot6(rate, a).store();
@@ -77,11 +77,12 @@ fn end_terms<S: StageSimd>(
     node: usize,
     at: usize,
 ) {
-    let a: Stages6<S> = load(simd, &scratch.poses[node][i].a);
-    let b: Stages6<S> = load(simd, &scratch.motions[motion][i].b);
-    let screws = &scratch.screws[motion];
+    let a: Stages6<S> = load(simd, &scratch.a[node][i]);
+    let b: Stages6<S> = load(simd, &scratch.b[motion][i]);
+    let (twists, rates) = (&scratch.twists[node], &scratch.twist_rates[motion]);
     for (&j, terms) in plan.tree.branch(i).iter().zip(&mut scratch.terms) {
-        let (twist, rate) = split(simd, &screws[j as usize]);
+        let twist: Stages6<S> = load(simd, &twists[j as usize]);
+        let rate: Stages6<S> = load(simd, &rates[j as usize]);
         terms[at] = dot6(rate, a).store();
         terms[at + 1] = dot6(twist, b).store();
     }

@@ -483,7 +483,7 @@ impl<M: StageMemory> StageKernel<M> for Examine<'_, M> {
                 finite = zero.mul_add(diagonal / pivot, finite);
                 finite = zero.mul_add(Stages::load(simd, &batch.end_rate[i]), finite);
                 // Momenta of the true velocities, which the columns contain but the residual does not.
-                let (start, end) = (&batch.start[i].by_q, &scratch.motions[END][i].b);
+                let (start, end) = (&batch.start[i].by_q, &scratch.b[END][i]);
                 for k in 0..6 {
                     finite = zero.mul_add(Stages::load(simd, &start[k]), finite);
                     finite = zero.mul_add(Stages::load(simd, &end[k]), finite);
