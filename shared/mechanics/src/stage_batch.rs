@@ -1,9 +1,9 @@
 //! Stage-parallel lifted linearisation of many Simpson steps of one tree: every SIMD lane is a stage of the horizon.
 //!
 //! A multiple-shooting controller linearises all stages of its horizon at once, each an independent step of the same tree from
-//! its own nodes, with its own input and time step. The index structure (parents, branches, elimination order) is shared, so one
-//! lane per stage needs no shuffles: see [`crate::stage_lanes`](self). The stages are never simulated: Newton's method is *lifted*
-//! into the controller's own iteration.
+//! its own nodes, with its own input and time step. The index structure (parents, branches, elimination order) is shared, so with
+//! one lane per stage (`stage_lanes`) the recursions need no shuffles. The stages are never simulated: Newton's method is
+//! *lifted* into the controller's own iteration.
 //!
 //! | letter | meaning |
 //! |---|---|
@@ -26,12 +26,12 @@
 //! elimination has no fill ([`crate::branch_lu`]). Velocities come out of the same pass: no product with `H[2,γ]`, no separate
 //! solve with the mass matrix.
 //!
-//! | | multiply-adds per stage, `d` depth of a joint |
+//! | phase | multiply-adds per stage, `d` depth of a joint |
 //! |---|---|
-//! | nodes and momenta | about 3300 n |
-//! | blocks | 150 Σ d |
+//! | nodes and momenta | about 900 n |
+//! | blocks | 160 Σ d |
 //! | elimination | 15 Σ d² |
-//! | columns | 21 n Σ d, less the zeros ([`column_plan`]) |
+//! | columns | 42 n Σ d, less the zeros of the way from the leaves to the root |
 //!
 //! Forces: gravity, joint damping and springs, held joint forces; fixed base. Everything else is refused.
 //!
