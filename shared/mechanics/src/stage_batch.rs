@@ -1,9 +1,9 @@
 //! Stage-parallel lifted linearisation of many Simpson steps of one tree: every SIMD lane is a stage of the horizon.
 //!
 //! A multiple-shooting controller linearises all stages of its horizon at once, each an independent step of the same tree from
-//! its own nodes, with its own input and time step. The index structure (parents, branches, elimination order) is shared, so one
-//! lane per stage needs no shuffles: see [`crate::stage_lanes`](self). The stages are never simulated: Newton's method is *lifted*
-//! into the controller's own iteration.
+//! its own nodes, with its own input and time step. The index structure (parents, branches, elimination order) is shared, so with
+//! one lane per stage (`stage_lanes`) the recursions need no shuffles. The stages are never simulated: Newton's method is
+//! *lifted* into the controller's own iteration.
 //!
 //! | letter | meaning |
 //! |---|---|
@@ -26,12 +26,12 @@
 //! elimination has no fill ([`crate::branch_lu`]). Velocities come out of the same pass: no product with `H[2,γ]`, no separate
 //! solve with the mass matrix.
 //!
-//! | | multiply-adds per stage, `d` depth of a joint |
+//! | phase | multiply-adds per stage, `d` depth of a joint |
 //! |---|---|
-//! | nodes and momenta | about 3300 n |
-//! | blocks | 150 Σ d |
+//! | nodes and momenta | about 900 n |
+//! | blocks | 160 Σ d |
 //! | elimination | 15 Σ d² |
-//! | columns | 21 n Σ d, less the zeros ([`column_plan`]) |
+//! | columns | 42 n Σ d, less the zeros of the way from the leaves to the root |
 //!
 //! Forces: gravity, joint damping and springs, held joint forces; fixed base. Everything else is refused.
 //!
@@ -203,10 +203,7 @@ impl Plan {
 struct Work<M> {
     batches: Vec<Batch<M>>,
     scratch: Scratch<M>,
-    /// `0 x` summed over everything that must be finite: zero or NaN.
-    finite: M,
-    /// Largest residual and correction.
-    largest: [M; 2],
+    marks: elimination::Marks<M>,
 }
 
 #[derive(Clone, Debug)]
@@ -412,7 +409,7 @@ impl StageBatch {
                 for _ in 0..iterations {
                     work.newton(simd, plan, first);
                 }
-                work.judge(plan, first, outcomes, false);
+                work.judge(simd, plan, first, outcomes, false);
             }
         });
     }
@@ -432,7 +429,7 @@ impl StageBatch {
             for first in (0..nodes).step_by(work.count()) {
                 let end = (first + work.count()).min(*stages);
                 work.linearize(simd, plan, first..end.max(first), output, &mut short);
-                work.judge(plan, first, outcomes, true);
+                work.judge(simd, plan, first, outcomes, true);
             }
         });
         match short {
@@ -663,8 +660,7 @@ impl<M: StageMemory> Work<M> {
         Self {
             batches: vec![Batch::new(n); vectors],
             scratch: Scratch::new(n, depth, pairs, if M::COUNT == 8 { 6 } else { 3 }),
-            finite: M::default(),
-            largest: [M::default(); 2],
+            marks: elimination::Marks::default(),
         }
     }
 
@@ -716,51 +712,29 @@ impl<M: StageMemory> Work<M> {
     }
 
     /// Fills the outcomes of the vector that begins with stage `first`.
-    fn judge(
+    fn judge<S: StageSimd<Memory = M>>(
         &mut self,
+        simd: S,
         plan: &Plan,
         first: usize,
         outcomes: &mut [Result<StageReport, StepError>],
         full: bool,
     ) {
-        let batch = &self.batches[first / M::COUNT];
-        let (finite, [residual, change]) = (&mut self.finite, &mut self.largest);
-        (*finite, *residual, *change) = (M::fill(0.0), M::fill(0.0), M::fill(0.0));
-        let largest = |target: &mut M, x: &M| {
-            for (t, x) in target.lanes_mut().iter_mut().zip(x.lanes()) {
-                *t = if x.abs() > *t { x.abs() } else { *t };
-            }
-        };
-        let mut regular = |x: &M| {
-            for (t, x) in finite.lanes_mut().iter_mut().zip(x.lanes()) {
-                *t += x * 0.0;
-            }
-        };
-        for i in 0..plan.n {
-            batch.nodes.iter().for_each(|node| regular(&node[i]));
-            regular(&batch.start_rate[i]);
-            regular(&batch.force[i]);
-            for x in &batch.residual[i] {
-                regular(x);
-                largest(residual, x);
-            }
-            for x in &batch.correction[i][..2] {
-                regular(x);
-                largest(change, x);
-            }
-            let used = if full { 3 } else { 2 };
-            batch.pivots[i][..used].iter().for_each(&mut regular);
-            if full {
-                regular(&batch.correction[i][2]);
-                regular(&batch.end_rate[i]);
-                // Squares of the velocities, which the columns contain but the residual does not.
-                batch.start[i].by_q.iter().for_each(&mut regular);
-                self.scratch.motions[memory::END][i].b.iter().for_each(&mut regular);
-            }
-        }
+        let Self { batches, scratch, marks, .. } = self;
+        let batch = &batches[first / M::COUNT];
+        simd.run(elimination::Examine { plan, batch, scratch, marks, full });
         for (lane, outcome) in outcomes.iter_mut().skip(first).take(M::COUNT).enumerate() {
-            let report = StageReport { residual: residual.lanes()[lane], change: change.lanes()[lane] };
-            *outcome = verdict(plan, batch, lane, full, finite.lanes()[lane] == 0.0).map(|()| report);
+            let at = |x: &M| x.lanes()[lane];
+            let good = at(&marks.finite) == 0.0
+                && at(&marks.coordinate) <= LARGEST_ANGLE
+                && at(&marks.block) < 1.0 / SINGULAR_BLOCK
+                && at(&marks.mass) < 1.0 / SINGULAR_MASS;
+            let report = StageReport { residual: at(&marks.residual), change: at(&marks.change) };
+            *outcome = if good {
+                Ok(report)
+            } else {
+                verdict(plan, batch, lane, full, at(&marks.finite) == 0.0).map(|()| report)
+            };
         }
     }
 }
@@ -774,23 +748,13 @@ fn verdict<M: StageMemory>(
     finite: bool,
 ) -> Result<(), StepError> {
     let at = |x: &M| x.lanes()[lane];
+    let bad = |entries: &[M]| entries.iter().any(|x| !at(x).is_finite());
     for (i, constants) in plan.tree.constants().iter().enumerate() {
         let far = |q: f64| q.is_finite() && q.abs() > LARGEST_ANGLE;
         if constants.revolute && batch.nodes.iter().any(|node| far(at(&node[i]))) {
             let reason = "a joint angle is beyond 1e6 rad";
             return Err(ModelError::Unsupported { body: i, reason }.into());
         }
-        let [determinant, product, mass, diagonal] = batch.pivots[i].map(|x| at(&x));
-        let size = product.abs() + (product - determinant).abs();
-        if finite && determinant.abs() <= SINGULAR_BLOCK * size {
-            return Err(FactorError::SingularPivot { body: i, pivot: determinant.abs() }.into());
-        }
-        if finite && full && mass <= SINGULAR_MASS * diagonal.abs() {
-            return Err(FactorError::SingularPivot { body: i, pivot: mass }.into());
-        }
-    }
-    if finite {
-        return Ok(());
     }
     let first = |quantity, values: &[M]| match values.iter().position(|x| !at(x).is_finite()) {
         Some(index) => Err(StepError::NonFinite { quantity, index }),
@@ -801,21 +765,29 @@ fn verdict<M: StageMemory>(
     first("end node", &batch.nodes[2])?;
     first("start velocity", &batch.start_rate)?;
     first("held joint force", &batch.force)?;
-    let bad = |entries: &[M]| entries.iter().any(|x| !at(x).is_finite());
     let residual = batch.residual.iter().position(|r| bad(r));
     if let Some(index) = residual {
         return Err(StepError::NonFinite { quantity: "DEL residual (joint)", index });
     }
-    // A pivot that is exactly zero ends here.
-    let pivot =
-        |p: &[M; 4]| at(&p[0]) == 0.0 || bad(&p[..2]) || (full && (at(&p[2]) == 0.0 || bad(&p[2..3])));
-    match batch.pivots.iter().rposition(pivot) {
-        Some(body) => {
-            let pivot = at(&batch.pivots[body][0]).abs();
-            Err(FactorError::SingularPivot { body, pivot }.into())
+    // Leaves first, as the elimination goes. Written so that a NaN counts as singular.
+    for body in (0..plan.n).rev() {
+        let [determinant, product, mass, diagonal] = batch.pivots[body].map(|x| at(&x));
+        let size = product.abs() + (product - determinant).abs();
+        let regular = determinant.abs() > SINGULAR_BLOCK * size;
+        if !regular {
+            return Err(FactorError::SingularPivot { body, pivot: determinant.abs() }.into());
         }
-        None => Err(StepError::NonFinite { quantity: "correction or column (stage)", index: 0 }),
+        let positive = mass > SINGULAR_MASS * diagonal.abs();
+        if full && !positive {
+            return Err(FactorError::SingularPivot { body, pivot: mass }.into());
+        }
     }
+    // What is left: coordinates beyond 1e6 m of slides, which are none of our business, and overflow.
+    if finite {
+        return Ok(());
+    }
+    let index = batch.correction.iter().position(|entries| bad(entries)).unwrap_or(0);
+    Err(StepError::NonFinite { quantity: "correction or momentum (joint)", index })
 }
 
 #[cfg(test)]

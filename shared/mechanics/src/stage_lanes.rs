@@ -16,6 +16,8 @@ pub(crate) trait StageMemory: Copy + Default {
     fn fill(x: f64) -> Self;
     fn lanes(&self) -> &[f64];
     fn lanes_mut(&mut self) -> &mut [f64];
+    /// Copies all numbers to the front of `target`, or as many as it holds.
+    fn copy_to(&self, target: &mut [f64]);
 }
 
 impl StageMemory for Quad {
@@ -28,6 +30,13 @@ impl StageMemory for Quad {
     }
     fn lanes_mut(&mut self) -> &mut [f64] {
         &mut self.0
+    }
+    #[inline(always)]
+    fn copy_to(&self, target: &mut [f64]) {
+        match target.first_chunk_mut() {
+            Some(whole) => *whole = self.0,
+            None => target.iter_mut().zip(self.0).for_each(|(t, x)| *t = x),
+        }
     }
 }
 
@@ -47,6 +56,13 @@ impl StageMemory for Oct {
     fn lanes_mut(&mut self) -> &mut [f64] {
         &mut self.0
     }
+    #[inline(always)]
+    fn copy_to(&self, target: &mut [f64]) {
+        match target.first_chunk_mut() {
+            Some(whole) => *whole = self.0,
+            None => target.iter_mut().zip(self.0).for_each(|(t, x)| *t = x),
+        }
+    }
 }
 
 /// Arithmetic on a vector of stages with one instruction set.
@@ -64,6 +80,10 @@ pub(crate) trait StageSimd: Copy {
     fn mul_add(self, a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector;
     /// `c - a b`.
     fn neg_mul_add(self, a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector;
+    /// The larger of `a` and `|x|`; either one for a NaN.
+    fn max_abs(self, a: Self::Vector, x: Self::Vector) -> Self::Vector;
+    /// The vectors `rows[0], rows[stride], ..`, as many as there are stages in one, to one vector per stage.
+    fn transpose(self, rows: &[Self::Memory], stride: usize, out: &mut [Self::Memory]);
     /// Runs a kernel with these instructions enabled.
     fn run<K: StageKernel<Self::Memory>>(self, kernel: K);
 }
@@ -114,15 +134,68 @@ impl StageSimd for Portable {
         self.sub(c, self.mul(a, b))
     }
     #[inline(always)]
+    fn max_abs(self, a: [f64; 4], x: [f64; 4]) -> [f64; 4] {
+        let [x0, x1, x2, x3] = x;
+        [a[0].max(x0.abs()), a[1].max(x1.abs()), a[2].max(x2.abs()), a[3].max(x3.abs())]
+    }
+    #[inline(always)]
+    fn transpose(self, rows: &[Quad], stride: usize, out: &mut [Quad]) {
+        transpose_quads(rows, stride, out);
+    }
+    #[inline(always)]
     fn run<K: StageKernel<Quad>>(self, kernel: K) {
         kernel.run(self);
+    }
+}
+
+#[inline(always)]
+fn transpose_quads(rows: &[Quad], stride: usize, out: &mut [Quad]) {
+    let (a, b, c, d) = (rows[0].0, rows[stride].0, rows[2 * stride].0, rows[3 * stride].0);
+    for lane in 0..4 {
+        out[lane].0 = [a[lane], b[lane], c[lane], d[lane]];
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+fn transpose_quads_with(_: pulp::x86::V3, rows: &[Quad], stride: usize, out: &mut [Quad]) {
+    transpose_quads(rows, stride, out);
+}
+
+/// Three rounds of eight shuffles: pairs of numbers, pairs of pairs, halves.
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+fn transpose_octs(simd: pulp::x86::V4, rows: &[Oct], stride: usize, out: &mut [Oct]) {
+    let avx = simd.avx512f;
+    let zero = pulp::cast::<[f64; 8], core::arch::x86_64::__m512d>([0.0; 8]);
+    let mut r = [zero; 8];
+    for k in 0..8 {
+        r[k] = pulp::cast(rows[k * stride].0);
+    }
+    for odd in 0..2 {
+        let mut pairs = [zero; 4];
+        for k in 0..4 {
+            pairs[k] = if odd == 0 {
+                avx._mm512_unpacklo_pd(r[2 * k], r[2 * k + 1])
+            } else {
+                avx._mm512_unpackhi_pd(r[2 * k], r[2 * k + 1])
+            };
+        }
+        let [a, b, c, d] = pairs;
+        let (upper, lower) = (avx._mm512_shuffle_f64x2::<0x88>(a, b), avx._mm512_shuffle_f64x2::<0x88>(c, d));
+        out[odd].0 = pulp::cast(avx._mm512_shuffle_f64x2::<0x88>(upper, lower));
+        out[4 + odd].0 = pulp::cast(avx._mm512_shuffle_f64x2::<0xdd>(upper, lower));
+        let (upper, lower) = (avx._mm512_shuffle_f64x2::<0xdd>(a, b), avx._mm512_shuffle_f64x2::<0xdd>(c, d));
+        out[2 + odd].0 = pulp::cast(avx._mm512_shuffle_f64x2::<0x88>(upper, lower));
+        out[6 + odd].0 = pulp::cast(avx._mm512_shuffle_f64x2::<0xdd>(upper, lower));
     }
 }
 
 /// The operations of one of pulp's tokens.
 #[cfg(target_arch = "x86_64")]
 macro_rules! with_pulp {
-    ($token:ty, $memory:ident, $vector:ident, $splat:ident, $add:ident, $sub:ident, $mul:ident, $div:ident, $fma:ident, $fnma:ident) => {
+    ($token:ty, $memory:ident, $vector:ident, $splat:ident, $add:ident, $sub:ident, $mul:ident, $div:ident, $fma:ident, $fnma:ident,
+     $abs:ident, $max:ident, $transpose:expr) => {
         impl StageSimd for $token {
             type Memory = $memory;
             type Vector = pulp::$vector;
@@ -163,6 +236,14 @@ macro_rules! with_pulp {
                 self.$fnma(a, b, c)
             }
             #[inline(always)]
+            fn max_abs(self, a: pulp::$vector, x: pulp::$vector) -> pulp::$vector {
+                self.$max(a, self.$abs(x))
+            }
+            #[inline(always)]
+            fn transpose(self, rows: &[$memory], stride: usize, out: &mut [$memory]) {
+                $transpose(self, rows, stride, out)
+            }
+            #[inline(always)]
             fn run<K: StageKernel<$memory>>(self, kernel: K) {
                 pulp::Simd::vectorize(self, With { kernel, simd: self });
             }
@@ -181,7 +262,10 @@ with_pulp!(
     mul_f64x4,
     div_f64x4,
     mul_add_f64x4,
-    negate_mul_add_f64x4
+    negate_mul_add_f64x4,
+    abs_f64x4,
+    max_f64x4,
+    transpose_quads_with
 );
 #[cfg(target_arch = "x86_64")]
 with_pulp!(
@@ -194,7 +278,10 @@ with_pulp!(
     mul_f64x8,
     div_f64x8,
     mul_add_f64x8,
-    negate_mul_add_f64x8
+    negate_mul_add_f64x8,
+    abs_f64x8,
+    max_f64x8,
+    transpose_octs
 );
 
 #[cfg(target_arch = "x86_64")]
@@ -246,6 +333,11 @@ impl<S: StageSimd> Stages<S> {
     #[inline(always)]
     pub fn neg_mul_add(self, b: Self, c: Self) -> Self {
         Self { v: self.simd.neg_mul_add(self.v, b.v, c.v), ..self }
+    }
+    /// The larger of `self` and `|x|`; either one for a NaN.
+    #[inline(always)]
+    pub fn max_abs(self, x: Self) -> Self {
+        Self { v: self.simd.max_abs(self.v, x.v), ..self }
     }
     /// The same number times a constant of the method.
     #[inline(always)]

@@ -46,13 +46,13 @@ impl<M: StageMemory> StageKernel<M> for Assemble<'_, M> {
 
 #[inline(always)]
 fn node_terms<S: StageSimd>(simd: S, plan: &Plan, scratch: &mut Scratch<S::Memory>, i: usize, alpha: usize) {
-    let (poses, motions) = (&scratch.poses[alpha], &scratch.motions[alpha]);
-    let a: Stages6<S> = load(simd, &poses[i].a);
-    let b: Stages6<S> = load(simd, &motions[i].b);
+    let a: Stages6<S> = load(simd, &scratch.a[alpha][i]);
+    let b: Stages6<S> = load(simd, &scratch.b[alpha][i]);
+    let (twists, rates) = (&scratch.twists[alpha], &scratch.twist_rates[alpha]);
     let c: Stages3<S> = cross(halves(a).1, splat(simd, &plan.gravity));
     for (&j, terms) in plan.tree.branch(i).iter().zip(&mut scratch.terms) {
-        let twist: Stages6<S> = load(simd, &poses[j as usize].twist);
-        let rate: Stages6<S> = load(simd, &motions[j as usize].twist_rate);
+        let twist: Stages6<S> = load(simd, &twists[j as usize]);
+        let rate: Stages6<S> = load(simd, &rates[j as usize]);
         let at = 4 * alpha;
         terms[at + MASS] = dot6(twist, a).store();
         terms[at + COLUMN] = dot6(rate, a).store();
@@ -77,12 +77,14 @@ fn end_terms<S: StageSimd>(
     node: usize,
     at: usize,
 ) {
-    let (poses, motions) = (&scratch.poses[node], &scratch.motions[motion]);
-    let a: Stages6<S> = load(simd, &poses[i].a);
-    let b: Stages6<S> = load(simd, &motions[i].b);
+    let a: Stages6<S> = load(simd, &scratch.a[node][i]);
+    let b: Stages6<S> = load(simd, &scratch.b[motion][i]);
+    let (twists, rates) = (&scratch.twists[node], &scratch.twist_rates[motion]);
     for (&j, terms) in plan.tree.branch(i).iter().zip(&mut scratch.terms) {
-        terms[at] = dot6(load(simd, &motions[j as usize].twist_rate), a).store();
-        terms[at + 1] = dot6(load(simd, &poses[j as usize].twist), b).store();
+        let twist: Stages6<S> = load(simd, &twists[j as usize]);
+        let rate: Stages6<S> = load(simd, &rates[j as usize]);
+        terms[at] = dot6(rate, a).store();
+        terms[at + 1] = dot6(twist, b).store();
     }
 }
 

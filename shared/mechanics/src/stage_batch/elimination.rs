@@ -13,8 +13,8 @@
 //! ```
 
 use super::column_plan::{Block, Column};
-use super::memory::{Batch, Scratch};
-use super::{Plan, TransitionOutput, WEIGHTS};
+use super::memory::{Batch, END, Scratch};
+use super::{Plan, SINGULAR_MASS, TransitionOutput, WEIGHTS};
 use crate::stage_lanes::{StageKernel, StageMemory, StageSimd, Stages, load};
 
 /// Eliminates the Newton matrix; with `full` also the rows of velocities. The mass matrix has its factor already.
@@ -294,7 +294,7 @@ fn all_blocks<S: StageSimd, const C: usize>(simd: S, work: &mut Columns<'_, '_, 
     for block in &plan.blocks {
         fill::<S, C>(simd, plan, block, work.batch, work.scratch);
         solve::<S, C>(simd, plan, block, work.scratch);
-        write::<S, C>(plan, block, work);
+        write::<S, C>(simd, plan, block, work);
     }
 }
 
@@ -349,14 +349,28 @@ fn fill<S: StageSimd, const C: usize>(
 
 /// Hands the columns of a solved block over: `q^1` stays with the stages, `q_{k+1}` and `q̇_{k+1}` go to the caller.
 #[inline(always)]
-fn write<S: StageSimd, const C: usize>(plan: &Plan, block: &Block, work: &mut Columns<'_, '_, S::Memory>) {
+fn write<S: StageSimd, const C: usize>(
+    simd: S,
+    plan: &Plan,
+    block: &Block,
+    work: &mut Columns<'_, '_, S::Memory>,
+) {
     let n = plan.n;
-    let columns = &work.scratch.columns;
+    let count = S::Memory::COUNT;
+    let Scratch { columns, transposed, .. } = &mut *work.scratch;
     for (c, column) in block.columns.iter().enumerate() {
         let index = column.index(n);
         let interior = &mut work.batch.interior[index * n..(index + 1) * n];
-        for (joint, cell) in interior.iter_mut().enumerate() {
-            *cell = columns[joint * 3 * C + c];
+        for (cell, row) in interior.iter_mut().zip(columns.chunks_exact(3 * C)) {
+            *cell = row[c];
+        }
+        if n >= count {
+            for (place, squares) in transposed.chunks_exact_mut(2 * count).enumerate() {
+                let (position, rate) = squares.split_at_mut(count);
+                let first = (place * count).min(n - count) * 3 * C + c;
+                simd.transpose(&columns[first + C..], 3 * C, position);
+                simd.transpose(&columns[first + 2 * C..], 3 * C, rate);
+            }
         }
         for (lane, stage) in work.stages.clone().enumerate() {
             let target = work.output.transition_column(stage, index);
@@ -366,9 +380,18 @@ fn write<S: StageSimd, const C: usize>(plan: &Plan, block: &Block, work: &mut Co
                 continue;
             };
             let (position, rate) = target.split_at_mut(n);
-            for (joint, (position, rate)) in position.iter_mut().zip(rate).enumerate() {
-                *position = columns[(joint * 3 + 1) * C + c].lanes()[lane];
-                *rate = columns[(joint * 3 + 2) * C + c].lanes()[lane];
+            if n >= count {
+                // The last square overlaps the one before where n is no multiple of the stages in a vector.
+                for (place, squares) in transposed.chunks_exact(2 * count).enumerate() {
+                    let first = (place * count).min(n - count);
+                    squares[lane].copy_to(&mut position[first..]);
+                    squares[count + lane].copy_to(&mut rate[first..]);
+                }
+            } else {
+                for (joint, (position, rate)) in position.iter_mut().zip(rate).enumerate() {
+                    *position = columns[(joint * 3 + 1) * C + c].lanes()[lane];
+                    *rate = columns[(joint * 3 + 2) * C + c].lanes()[lane];
+                }
             }
         }
     }
@@ -398,5 +421,80 @@ impl<M: StageMemory> StageKernel<M> for MoveInterior<'_, M> {
         for (node, sum) in batch.nodes[1].iter_mut().zip(sums.iter()) {
             *node = (Stages::load(simd, node) + Stages::load(simd, sum)).store();
         }
+    }
+}
+
+/// What [`super::StageBatch::outcome`] is made of, for all stages of a vector.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Marks<M> {
+    /// Largest absolute residual and correction of the nodes.
+    pub residual: M,
+    pub change: M,
+    /// Zero when everything is finite, otherwise NaN.
+    pub finite: M,
+    /// Largest absolute coordinate of a node.
+    pub coordinate: M,
+    /// Largest ratio of the products in the determinant of a pivot block to the determinant.
+    pub block: M,
+    /// Largest ratio of the diagonal of the mass matrix to its pivot.
+    pub mass: M,
+}
+
+/// Takes the marks of one vector of stages; `full` after a linearisation.
+pub(crate) struct Examine<'a, M> {
+    pub plan: &'a Plan,
+    pub batch: &'a Batch<M>,
+    pub scratch: &'a Scratch<M>,
+    pub marks: &'a mut Marks<M>,
+    pub full: bool,
+}
+
+impl<M: StageMemory> StageKernel<M> for Examine<'_, M> {
+    #[inline(always)]
+    fn run<S: StageSimd<Memory = M>>(self, simd: S) {
+        let Self { plan, batch, scratch, marks, full } = self;
+        let zero = Stages::splat(simd, 0.0);
+        let (mut residual, mut change, mut coordinate, mut block, mut mass) = (zero, zero, zero, zero, zero);
+        let mut finite = zero;
+        for i in 0..plan.n {
+            for alpha in 0..3 {
+                let q = Stages::load(simd, &batch.nodes[alpha][i]);
+                coordinate = coordinate.max_abs(q);
+                finite = zero.mul_add(q, finite);
+            }
+            let [first, second] = load(simd, &batch.residual[i]);
+            residual = residual.max_abs(first).max_abs(second);
+            let [middle, end, rate] = load(simd, &batch.correction[i]);
+            change = change.max_abs(middle).max_abs(end);
+            let [determinant, product, pivot, diagonal] = load(simd, &batch.pivots[i]);
+            let other = product - determinant;
+            block = block.max_abs(product / determinant).max_abs(other / determinant);
+            // In pairs: the sum of finite numbers may overflow, their products with zero do not.
+            finite = zero.mul_add(first, zero.mul_add(second, finite));
+            finite = zero.mul_add(middle, zero.mul_add(end, finite));
+            finite = zero.mul_add(determinant, zero.mul_add(product / determinant, finite));
+            finite = zero.mul_add(Stages::load(simd, &batch.start_rate[i]), finite);
+            finite = zero.mul_add(Stages::load(simd, &batch.force[i]), finite);
+            if full {
+                mass = mass.max_abs(diagonal / pivot);
+                // 2 / SINGULAR_MASS for a negative pivot, otherwise zero.
+                mass = mass.max_abs(((pivot - zero.max_abs(pivot)) / pivot).times(1.0 / SINGULAR_MASS));
+                finite = zero.mul_add(rate, zero.mul_add(pivot, finite));
+                finite = zero.mul_add(diagonal / pivot, finite);
+                finite = zero.mul_add(Stages::load(simd, &batch.end_rate[i]), finite);
+                // Momenta of the true velocities, which the columns contain but the residual does not.
+                let (start, end) = (&batch.start[i].by_q, &scratch.b[END][i]);
+                for k in 0..6 {
+                    finite = zero.mul_add(Stages::load(simd, &start[k]), finite);
+                    finite = zero.mul_add(Stages::load(simd, &end[k]), finite);
+                }
+            }
+        }
+        marks.residual = residual.store();
+        marks.change = change.store();
+        marks.finite = finite.store();
+        marks.coordinate = coordinate.store();
+        marks.block = block.store();
+        marks.mass = mass.store();
     }
 }

@@ -73,33 +73,6 @@ impl<M: StageMemory> Batch<M> {
     }
 }
 
-/// One body at one node.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Pose<M> {
-    pub rotation: [M; 9],
-    pub position: [M; 3],
-    /// `S`.
-    pub twist: [M; 6],
-    /// Inertia about the origin of {0}: `h`, then `J` (xx, yy, zz, xy, xz, yz).
-    pub own: [M; 9],
-    /// The same of the body and all it carries.
-    pub composite: [M; 9],
-    /// `A = 𝓜 S`.
-    pub a: [M; 6],
-}
-
-/// One body in one motion through a node.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Motion<M> {
-    pub velocity: [M; 6],
-    /// `Ṡ`.
-    pub twist_rate: [M; 6],
-    /// `μ`.
-    pub momentum: [M; 6],
-    /// `B = 𝓜 Ṡ - ad^D_μ S`.
-    pub b: [M; 6],
-}
-
 /// Motions: through the nodes with the rates of the interpolation polynomial, then with the true velocities at both ends.
 pub(crate) const MOTIONS: usize = 5;
 /// Node of every motion.
@@ -119,9 +92,25 @@ pub(crate) type BackwardPanel<M> = [M; 7];
 /// Working memory shared by all vectors of stages.
 #[derive(Clone, Debug)]
 pub(crate) struct Scratch<M> {
-    pub poses: [Vec<Pose<M>>; NODES],
-    pub motions: [Vec<Motion<M>>; MOTIONS],
+    /// Body frames at the node last evaluated, which is the first one.
+    pub rotations: Vec<[M; 9]>,
+    pub positions: Vec<[M; 3]>,
+    /// `𝓜` about the origin of {0} at every node: `h`, then `J` (xx, yy, zz, xy, xz, yz).
+    pub composites: [Vec<[M; 9]>; NODES],
+    /// `S`.
+    pub twists: [Vec<[M; 6]>; NODES],
+    /// `A = 𝓜 S`.
+    pub a: [Vec<[M; 6]>; NODES],
     pub rates: [Vec<M>; MOTIONS],
+    /// `Ṡ`.
+    pub twist_rates: [Vec<[M; 6]>; MOTIONS],
+    /// `B = 𝓜 Ṡ - ad^D_μ S`.
+    pub b: [Vec<[M; 6]>; MOTIONS],
+    /// Velocities and momenta of the bodies in the motion last evaluated.
+    pub velocities: Vec<[M; 6]>,
+    pub momenta: Vec<[M; 6]>,
+    /// `r^0, r^1, p^2` as they grow.
+    pub rows: Vec<[M; NODES]>,
     /// `p^2` at the nodes.
     pub end_momentum: Vec<M>,
     /// Terms of the pairs of one body, by position on its branch.
@@ -132,21 +121,33 @@ pub(crate) struct Scratch<M> {
     pub sides: Vec<[M; 7]>,
     /// Block of columns that is being solved: `[(joint 3 + row) columns + column]`.
     pub columns: Vec<M>,
+    /// One column, stage by stage: squares of positions and of rates in turn.
+    pub transposed: Vec<M>,
 }
 
 impl<M: StageMemory> Scratch<M> {
     pub fn new(n: usize, depth: usize, pairs: usize, columns: usize) -> Self {
         let zeros = || vec![M::default(); n];
+        let twists = || vec![[M::default(); 6]; n];
         Self {
-            poses: core::array::from_fn(|_| vec![Pose::default(); n]),
-            motions: core::array::from_fn(|_| vec![Motion::default(); n]),
+            rotations: vec![[M::default(); 9]; n],
+            positions: vec![[M::default(); 3]; n],
+            composites: core::array::from_fn(|_| vec![[M::default(); 9]; n]),
+            twists: core::array::from_fn(|_| twists()),
+            a: core::array::from_fn(|_| twists()),
             rates: core::array::from_fn(|_| zeros()),
+            twist_rates: core::array::from_fn(|_| twists()),
+            b: core::array::from_fn(|_| twists()),
+            velocities: twists(),
+            momenta: twists(),
+            rows: vec![[M::default(); NODES]; n],
             end_momentum: zeros(),
             terms: vec![[M::default(); 16]; depth],
             forward: vec![[M::default(); 7]; pairs],
             backward: vec![[M::default(); 7]; pairs],
             sides: vec![[M::default(); 7]; pairs],
             columns: vec![M::default(); 3 * n * columns],
+            transposed: vec![M::default(); 2 * n.next_multiple_of(M::COUNT)],
         }
     }
 }

@@ -1,10 +1,15 @@
 //! Algorithm 1 of a vector of stages: nodes, both ends, residual, velocity at the end.
 //!
 //! Every body's inertia is taken about the origin of {0}, so that momenta, composites and their products with twists are plain
-//! sums. Gravity needs no recursion: with `A_i = 𝓜_i S_i = [·; l_i]`, its joint force is `g·l_i`, and Algorithm 3's column is
-//! `c_i = l_i × g`.
+//! sums. With the composite inertias `𝓜_i` and `A_i = 𝓜_i S_i = [·; l_i]` known,
+//!
+//! ```text
+//! μ_i = 𝓜_i v_par + Σ_{k = i and beyond} A_k q̇_k        joint force of gravity: g·l_i        column of Algorithm 3: c_i = l_i × g
+//! ```
+//!
+//! because joint k moves all it carries as one body: no momenta of single bodies, no recursion for gravity.
 
-use super::memory::{Batch, END, NODE_OF, Pose, START, Scratch};
+use super::memory::{Batch, END, NODE_OF, START, Scratch};
 use super::{DERIVATIVE, NODES, Plan, WEIGHTS};
 use crate::stage_lanes::{
     StageKernel, StageMemory, StageSimd, Stages, Stages3, Stages6, add, bracket, cross, cross_add, dot3,
@@ -26,17 +31,21 @@ impl<M: StageMemory> StageKernel<M> for Evaluate<'_, M> {
     fn run<S: StageSimd<Memory = M>>(self, simd: S) {
         let Self { plan, batch, scratch, full } = self;
         interpolate(simd, plan, batch, scratch);
-        for alpha in 0..NODES {
-            poses(simd, plan, &batch.nodes[alpha], &mut scratch.poses[alpha]);
+        for alpha in (0..NODES).rev() {
+            poses(simd, plan, &batch.nodes[alpha], scratch, alpha);
         }
         for v in 0..END {
-            motion(simd, plan, scratch, v);
+            motion(simd, plan, batch, scratch, v);
         }
-        rows(simd, plan, batch, scratch);
+        for (i, rows) in scratch.rows.iter().enumerate() {
+            let [first, middle, end] = load(simd, rows);
+            store(&mut batch.residual[i], [first, middle]);
+            scratch.end_momentum[i] = end.store();
+        }
         if full {
             keep_start(simd, plan, batch, scratch);
             end_velocity(simd, plan, batch, scratch);
-            motion(simd, plan, scratch, END);
+            motion(simd, plan, batch, scratch, END);
         }
     }
 }
@@ -59,12 +68,21 @@ fn interpolate<S: StageSimd>(
             scratch.rates[alpha][i] = sum.store();
         }
         scratch.rates[START][i] = batch.start_rate[i];
+        store(&mut scratch.rows[i], [Stages::splat(simd, 0.0); NODES]);
     }
 }
 
 /// Poses, joint twists and inertias of all bodies at one node; composites; `A`.
 #[inline(always)]
-fn poses<S: StageSimd>(simd: S, plan: &Plan, q: &[S::Memory], poses: &mut [Pose<S::Memory>]) {
+fn poses<S: StageSimd>(
+    simd: S,
+    plan: &Plan,
+    q: &[S::Memory],
+    scratch: &mut Scratch<S::Memory>,
+    alpha: usize,
+) {
+    let Scratch { rotations, positions, composites, twists, a, .. } = scratch;
+    let (composites, twists, a) = (&mut composites[alpha], &mut twists[alpha], &mut a[alpha]);
     let zero = Stages::splat(simd, 0.0);
     for (i, constants) in plan.tree.constants().iter().enumerate() {
         let q = Stages::load(simd, &q[i]);
@@ -82,10 +100,9 @@ fn poses<S: StageSimd>(simd: S, plan: &Plan, q: &[S::Memory], poses: &mut [Pose<
         let mut axis = splat(simd, &constants.axis);
         let mut rotation = e;
         if constants.parent != NO_PARENT {
-            let parent = &poses[constants.parent];
-            let turn = load(simd, &parent.rotation);
+            let turn = load(simd, &rotations[constants.parent]);
             rotation = mat_mul(&turn, &e);
-            origin = add(load(simd, &parent.position), mat_vec(&turn, origin));
+            origin = add(load(simd, &positions[constants.parent]), mat_vec(&turn, origin));
             axis = mat_vec(&turn, axis);
         }
         let mut position = add(origin, mat_vec(&rotation, splat(simd, &constants.com)));
@@ -95,23 +112,19 @@ fn poses<S: StageSimd>(simd: S, plan: &Plan, q: &[S::Memory], poses: &mut [Pose<
             position = scale_add(q, axis, position);
             join([zero; 3], axis)
         };
-        let own = inertia(simd, constants, &rotation, position);
-        let pose = &mut poses[i];
-        store(&mut pose.rotation, rotation);
-        store(&mut pose.position, position);
-        store(&mut pose.twist, twist);
-        store(&mut pose.own, own);
-        store(&mut pose.composite, own);
+        store(&mut composites[i], inertia(simd, constants, &rotation, position));
+        store(&mut rotations[i], rotation);
+        store(&mut positions[i], position);
+        store(&mut twists[i], twist);
     }
     for i in (0..plan.n).rev() {
         let constants = &plan.tree.constants()[i];
-        let composite = load(simd, &poses[i].composite);
+        let composite = load(simd, &composites[i]);
         if constants.parent != NO_PARENT {
-            let target = &mut poses[constants.parent].composite;
+            let target = &mut composites[constants.parent];
             store(target, add(load(simd, target), composite));
         }
-        let a = times(simd, constants.subtree_mass, &composite, load(simd, &poses[i].twist));
-        store(&mut poses[i].a, a);
+        store(&mut a[i], times(simd, constants.subtree_mass, &composite, load(simd, &twists[i])));
     }
 }
 
@@ -153,75 +166,67 @@ fn times<S: StageSimd>(simd: S, mass: f64, inertia: &[Stages<S>; 9], x: Stages6<
     join(upper, sub(scale(mass, n), cross(h, s)))
 }
 
-/// Velocities, articulated momenta and `B` of one motion.
+/// Velocities, `Ṡ`, `B` and the rows of one motion.
 #[inline(always)]
-fn motion<S: StageSimd>(simd: S, plan: &Plan, scratch: &mut Scratch<S::Memory>, v: usize) {
-    let poses = &scratch.poses[NODE_OF[v]];
-    let motions = &mut scratch.motions[v];
-    let zero = [Stages::splat(simd, 0.0); 6];
+fn motion<S: StageSimd>(
+    simd: S,
+    plan: &Plan,
+    batch: &Batch<S::Memory>,
+    scratch: &mut Scratch<S::Memory>,
+    v: usize,
+) {
+    let node = NODE_OF[v];
+    let Scratch { composites, twists, a, rates, twist_rates, b, velocities, momenta, rows, .. } = scratch;
+    let (composites, twists, a, rates) = (&composites[node], &twists[node], &a[node], &rates[v]);
+    let (twist_rates, b) = (&mut twist_rates[v], &mut b[v]);
+    let zero = Stages::splat(simd, 0.0);
     for (i, constants) in plan.tree.constants().iter().enumerate() {
-        let twist: Stages6<S> = load(simd, &poses[i].twist);
-        let rate = Stages::load(simd, &scratch.rates[v][i]);
+        let twist: Stages6<S> = load(simd, &twists[i]);
+        let rate = Stages::load(simd, &rates[i]);
         let (carried, twist_rate) = if constants.parent == NO_PARENT {
-            (zero, zero)
+            ([zero; 6], [zero; 6])
         } else {
-            let carried = load(simd, &motions[constants.parent].velocity);
+            let carried = load(simd, &velocities[constants.parent]);
             // ad_{v_i} S_i = ad_{v_par} S_i, because S_i commutes with itself.
             (carried, bracket(carried, twist))
         };
-        let velocity = scale_add(rate, twist, carried);
-        let momentum = times(simd, constants.mass, &load(simd, &poses[i].own), velocity);
-        let motion = &mut motions[i];
-        store(&mut motion.velocity, velocity);
-        store(&mut motion.twist_rate, twist_rate);
-        store(&mut motion.momentum, momentum);
+        store(&mut velocities[i], scale_add(rate, twist, carried));
+        store(&mut twist_rates[i], twist_rate);
+        store(&mut momenta[i], scale(rate, load(simd, &a[i])));
     }
-    for i in (0..plan.n).rev() {
-        let constants = &plan.tree.constants()[i];
-        let momentum = load(simd, &motions[i].momentum);
-        if constants.parent != NO_PARENT {
-            let target = &mut motions[constants.parent].momentum;
-            store(target, add(load(simd, target), momentum));
-        }
-        let moved = times(
-            simd,
-            constants.subtree_mass,
-            &load(simd, &poses[i].composite),
-            load(simd, &motions[i].twist_rate),
-        );
-        let bracket = dual_bracket(momentum, load(simd, &poses[i].twist));
-        store(&mut motions[i].b, sub(moved, bracket));
-    }
-}
-
-/// The rows `r^0, r^1` and `p^2`.
-#[inline(always)]
-fn rows<S: StageSimd>(simd: S, plan: &Plan, batch: &mut Batch<S::Memory>, scratch: &mut Scratch<S::Memory>) {
     let step = Stages::load(simd, &batch.time_step);
     let gravity = splat(simd, &plan.gravity);
-    for (i, constants) in plan.tree.constants().iter().enumerate() {
-        let held = Stages::load(simd, &batch.force[i]);
-        let start: Stages6<S> = load(simd, &scratch.motions[START][i].momentum);
-        let zero = Stages::splat(simd, 0.0);
-        let mut rows = [dot6(load(simd, &scratch.poses[0][i].twist), start), zero, zero];
-        for beta in 0..NODES {
-            let (pose, motion) = (&scratch.poses[beta][i], &scratch.motions[beta][i]);
-            let momentum = load(simd, &motion.momentum);
-            let projected = dot6(load(simd, &pose.twist), momentum);
-            for alpha in 0..NODES {
-                let weight = Stages::splat(simd, WEIGHTS[beta] * DERIVATIVE[beta][alpha]);
-                rows[alpha] = projected.mul_add(weight, rows[alpha]);
-            }
-            let rate = Stages::load(simd, &scratch.rates[beta][i]);
-            let stretch = Stages::load(simd, &batch.nodes[beta][i]) - Stages::splat(simd, constants.rest);
-            let mut force = Stages::splat(simd, constants.damping).neg_mul_add(rate, held);
-            force = Stages::splat(simd, constants.stiffness).neg_mul_add(stretch, force);
-            force = force + dot3(halves(load(simd, &pose.a)).1, gravity);
-            force = force + dot6(load(simd, &motion.twist_rate), momentum);
-            rows[beta] = step.times(WEIGHTS[beta]).mul_add(force, rows[beta]);
+    for i in (0..plan.n).rev() {
+        let constants = &plan.tree.constants()[i];
+        let mut momentum: Stages6<S> = load(simd, &momenta[i]);
+        let (twist, twist_rate): (Stages6<S>, Stages6<S>) =
+            (load(simd, &twists[i]), load(simd, &twist_rates[i]));
+        let mut moved = [zero; 6];
+        if constants.parent != NO_PARENT {
+            let target = &mut momenta[constants.parent];
+            store(target, add(load(simd, target), momentum));
+            let composite = load(simd, &composites[i]);
+            let carried = load(simd, &velocities[constants.parent]);
+            momentum = add(momentum, times(simd, constants.subtree_mass, &composite, carried));
+            moved = times(simd, constants.subtree_mass, &composite, twist_rate);
         }
-        store(&mut batch.residual[i], [rows[0], rows[1]]);
-        scratch.end_momentum[i] = rows[2].store();
+        store(&mut b[i], sub(moved, dual_bracket(momentum, twist)));
+        let projected = dot6(twist, momentum);
+        let row = &mut rows[i];
+        if v < NODES {
+            for alpha in 0..NODES {
+                let weight = Stages::splat(simd, WEIGHTS[v] * DERIVATIVE[v][alpha]);
+                row[alpha] = projected.mul_add(weight, Stages::load(simd, &row[alpha])).store();
+            }
+            let stretch = Stages::load(simd, &batch.nodes[v][i]) - Stages::splat(simd, constants.rest);
+            let mut force = Stages::load(simd, &batch.force[i]);
+            force = Stages::splat(simd, constants.damping).neg_mul_add(Stages::load(simd, &rates[i]), force);
+            force = Stages::splat(simd, constants.stiffness).neg_mul_add(stretch, force);
+            force = force + dot3(halves(load(simd, &a[i])).1, gravity) + dot6(twist_rate, momentum);
+            row[v] = step.times(WEIGHTS[v]).mul_add(force, Stages::load(simd, &row[v])).store();
+        } else if v == START {
+            row[0] = (Stages::load(simd, &row[0]) + projected).store();
+        }
     }
 }
 
@@ -237,20 +242,20 @@ fn keep_start<S: StageSimd>(
     let zero = Stages::splat(simd, 0.0);
     let (mut momentum, mut first_moment) = ([zero; 6], [zero; 3]);
     for (i, constants) in plan.tree.constants().iter().enumerate() {
-        let (pose, motion) = (&scratch.poses[0][i], &scratch.motions[START][i]);
         if constants.parent == NO_PARENT {
-            momentum = add(momentum, load(simd, &motion.momentum));
-            let [x, y, z, ..]: [Stages<S>; 9] = load(simd, &pose.composite);
+            momentum = add(momentum, load(simd, &scratch.momenta[i]));
+            let [x, y, z, ..]: [Stages<S>; 9] = load(simd, &scratch.composites[0][i]);
             first_moment = add(first_moment, [x, y, z]);
         }
+        let a = load(simd, &scratch.a[0][i]);
         let kept = &mut batch.start[i];
-        store(&mut kept.rotation, load(simd, &pose.rotation));
-        store(&mut kept.position, load(simd, &pose.position));
-        store(&mut kept.twist, load(simd, &pose.twist));
-        store(&mut kept.velocity, load(simd, &motion.velocity));
-        store(&mut kept.by_rate, load(simd, &pose.a));
-        store(&mut kept.by_q, load(simd, &motion.b));
-        kept.gravity = (-dot3(halves(load(simd, &pose.a)).1, gravity)).store();
+        store(&mut kept.rotation, load(simd, &scratch.rotations[i]));
+        store(&mut kept.position, load(simd, &scratch.positions[i]));
+        store(&mut kept.twist, load(simd, &scratch.twists[0][i]));
+        store(&mut kept.velocity, load(simd, &scratch.velocities[i]));
+        store(&mut kept.by_rate, a);
+        store(&mut kept.by_q, load(simd, &scratch.b[START][i]));
+        kept.gravity = (-dot3(halves(a).1, gravity)).store();
     }
     store(&mut batch.momentum, momentum);
     store(&mut batch.first_moment, first_moment);
@@ -264,12 +269,12 @@ fn end_velocity<S: StageSimd>(
     batch: &mut Batch<S::Memory>,
     scratch: &mut Scratch<S::Memory>,
 ) {
-    let poses = &scratch.poses[2];
+    let (twists, columns) = (&scratch.twists[2], &scratch.a[2]);
     let (forward, backward) = (&mut scratch.forward, &mut scratch.backward);
     for i in 0..plan.n {
-        let a: Stages6<S> = load(simd, &poses[i].a);
+        let a: Stages6<S> = load(simd, &columns[i]);
         for (place, &j) in plan.tree.branch(i).iter().enumerate() {
-            forward[plan.pair(i) + place][6] = dot6(load(simd, &poses[j as usize].twist), a).store();
+            forward[plan.pair(i) + place][6] = dot6(load(simd, &twists[j as usize]), a).store();
         }
         batch.pivots[i][3] = forward[plan.own_pair(i)][6];
     }
