@@ -150,6 +150,8 @@ fn trial_setup(arguments: &PushMapArguments) -> Result<Setup, Failure> {
     scenario.reach = None;
     scenario.duration_s = REST_S + arguments.push_s + arguments.recovery_s;
     scenario.success.settle_time_s = scenario.duration_s;
+    // The edge of the sole may be used to the full.
+    scenario.success.min_cop_margin_m = -1.0;
     if !(arguments.push_s > 0.0 && arguments.recovery_s > 0.0 && arguments.resolution_ns > 0.0) {
         return Err(Failure::Input("--push-s, --recovery-s, --resolution-ns: must be positive".to_owned()));
     }

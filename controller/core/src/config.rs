@@ -1,6 +1,5 @@
 //! What is chosen for a controller: times, weights, limits.
 
-use alloc::vec;
 use alloc::vec::Vec;
 
 use crate::errors::ControlError;
@@ -59,7 +58,7 @@ impl Default for ConstraintConfig {
             torque_fraction: 0.98,
             friction: 0.6,
             friction_sides: 8,
-            cop_margin_m: 0.008,
+            cop_margin_m: 0.003,
             yaw_arm_m: 0.06,
             min_force_fraction: 0.1,
             contact_penalty: 1.0,
@@ -101,18 +100,13 @@ pub struct ControllerConfig {
 }
 
 impl Default for ControllerConfig {
-    /// 200 Hz, one cycle of delay, 20 stages over 0.7 s.
+    /// 200 Hz, one cycle of delay, 20 stages over 1 s.
     fn default() -> Self {
-        let stages = vec![
-            StageBlock { count: 6, seconds: 0.01 },
-            StageBlock { count: 5, seconds: 0.02 },
-            StageBlock { count: 9, seconds: 0.06 },
-        ];
         Self {
             kind: ControllerKind::Mpc,
             period_s: 0.005,
             delay_s: 0.005,
-            stages,
+            stages: Self::stages_for(1.0, 20),
             weights: TaskWeights::default(),
             constraints: ConstraintConfig::default(),
             qp: ProjectedQpOptions::default(),
@@ -127,12 +121,12 @@ impl Default for ControllerConfig {
 }
 
 impl ControllerConfig {
-    /// Stage lengths for a horizon of `horizon_s` in `count` stages: about a third of them fine (10 ms), a quarter of 20 ms, the
-    /// rest equal and coarse.
+    /// Stage lengths for a horizon of `horizon_s` in `count` stages: about a third of them fine (10 ms in a horizon of 1 s), a
+    /// quarter twice as long, the rest equal and coarse.
     pub fn stages_for(horizon_s: f64, count: usize) -> Vec<StageBlock> {
         let (fine, middle) = (count * 3 / 10, count / 4);
         let coarse = count.saturating_sub(fine + middle).max(1);
-        let unit = horizon_s / 1.0;
+        let unit = horizon_s;
         let rest = horizon_s - unit * (0.01 * fine as f64 + 0.02 * middle as f64);
         let blocks = [
             StageBlock { count: fine, seconds: 0.01 * unit },

@@ -324,7 +324,7 @@ impl Default for ControllerSettings {
             kind: ControllerKind::Mpc,
             mpc_rate_hz: 200.0,
             servo_rate_hz: 1000.0,
-            horizon_s: 0.7,
+            horizon_s: 1.0,
             stages: 20,
             delay_cycles: 1,
             max_state_age_s: 0.05,
@@ -355,7 +355,7 @@ impl Default for WeightSettings {
 
 impl Default for ConstraintSettings {
     fn default() -> Self {
-        Self { torque_fraction: 0.98, friction: 0.6, cop_margin_m: 0.008, yaw_arm_m: 0.06 }
+        Self { torque_fraction: 0.98, friction: 0.6, cop_margin_m: 0.003, yaw_arm_m: 0.06 }
     }
 }
 
