@@ -34,7 +34,7 @@ use crate::del_hessian::DelHessian;
 use crate::del_residual::DelWorkspace;
 use crate::errors::{ModelError, StepError};
 use crate::kinetic_hessian::KineticHessian;
-use crate::lanes::{Kernel, Simd, WideLane};
+use crate::lanes::{Kernel, LANES, Simd, WIDE, WideLane};
 use crate::mass_matrix_factor::MassMatrixFactor;
 use crate::newton_direction::{NewtonDirection, NewtonSolver};
 use crate::recursive_linearize::{AllColumns, ColumnSweeps};
@@ -538,18 +538,18 @@ impl Kernel for EndRows<'_> {
     type Output = ();
     #[inline(always)]
     fn run<S: Simd>(mut self, simd: S) {
-        for at in (0..self.z.stride()).step_by(2) {
-            match self.s {
-                1 if S::SPECIALISE => end_chunk(simd, &mut self, at, 1),
-                2 if S::SPECIALISE => end_chunk(simd, &mut self, at, 2),
-                s => end_chunk(simd, &mut self, at, s),
+        for at in (0..self.z.stride()).step_by(WIDE) {
+            match (self.s, self.hessian.groups) {
+                (1, 1) if S::SPECIALISE => end_chunk(simd, &mut self, at, 1, 1),
+                (2, 1) if S::SPECIALISE => end_chunk(simd, &mut self, at, 2, 1),
+                (s, groups) => end_chunk(simd, &mut self, at, s, groups),
             }
         }
     }
 }
 
 #[inline(always)]
-fn end_chunk<S: Simd>(simd: S, work: &mut EndRows<'_>, at: usize, s: usize) {
+fn end_chunk<S: Simd>(simd: S, work: &mut EndRows<'_>, at: usize, s: usize, groups: usize) {
     let (tree, hessian) = (work.tree, work.hessian);
     let stride = work.z.stride();
     let z = work.z.quads();
@@ -566,6 +566,7 @@ fn end_chunk<S: Simd>(simd: S, work: &mut EndRows<'_>, at: usize, s: usize) {
         for (position, &j) in tree.branch(i).iter().enumerate() {
             let j = j as usize;
             let pair = first + position;
+            let (block, mirror) = hessian.pair_blocks(pair, (s + 1) * groups);
             let (mut own_rate, mut other_rate) = (0.0, 0.0);
             if let Some(kinetic) = work.kinetic {
                 let terms = kinetic.pair(i, position);
@@ -574,8 +575,11 @@ fn end_chunk<S: Simd>(simd: S, work: &mut EndRows<'_>, at: usize, s: usize) {
             let target = (n + j) * stride + at;
             let mut moved = WideLane::load(simd, out, target);
             for gamma in 1..=s {
-                let mut ahead = hessian.entry(pair, s, gamma);
-                let mut behind = hessian.mirrored(pair, s, gamma);
+                let mut ahead = block[s * groups + gamma / LANES].0[gamma % LANES];
+                let mut behind = match mirror {
+                    Some(mirror) => mirror[s * groups + gamma / LANES].0[gamma % LANES],
+                    None => block[gamma * groups + s / LANES].0[s % LANES],
+                };
                 if gamma == s {
                     ahead -= own_rate;
                     behind -= other_rate;
@@ -608,7 +612,7 @@ impl Kernel for SolveMass<'_> {
         let stride = out.stride();
         let n = factor.pivots().len();
         let out = out.quads_mut();
-        for at in (0..stride).step_by(2) {
+        for at in (0..stride).step_by(WIDE) {
             let row = |k: usize| (n + k) * stride + at;
             for k in (0..n).rev() {
                 let own = WideLane::load(simd, out, row(k));
