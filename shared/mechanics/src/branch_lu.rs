@@ -25,7 +25,7 @@ use crate::del_hessian::DelHessian;
 use crate::del_residual::DelWorkspace;
 use crate::dense_lu::DenseLu;
 use crate::errors::FactorError;
-use crate::lanes::{Instructions, Kernel, LANES, Lane, Quad, Simd, WideLane};
+use crate::lanes::{Instructions, Kernel, LANES, Lane, Quad, Simd, WIDE, WideLane};
 use crate::lobatto::MAX_UNKNOWN_NODES;
 use crate::newton_direction::{BaseEntry, NewtonDirection, jacobian_column_rule};
 use crate::row_matrix::RowMatrix;
@@ -387,7 +387,7 @@ impl Kernel for ForwardMany<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { tree, lu, rhs } = self;
-        for at in (0..rhs.stride()).step_by(2) {
+        for at in (0..rhs.stride()).step_by(WIDE) {
             match lu.s {
                 1 if S::SPECIALISE => forward_chunk::<S, 1>(simd, tree, lu, rhs, at, 1),
                 2 if S::SPECIALISE => forward_chunk::<S, 2>(simd, tree, lu, rhs, at, 2),
@@ -398,7 +398,7 @@ impl Kernel for ForwardMany<'_> {
     }
 }
 
-/// Leaves to root, eight columns at a time. Columns of the linearisation are zero outside a subtree: those rows are skipped.
+/// Leaves to root, sixteen columns at a time. Columns of the linearisation are zero outside a subtree: those rows are skipped.
 #[inline(always)]
 fn forward_chunk<S: Simd, const N: usize>(
     simd: S,
@@ -458,7 +458,7 @@ impl Kernel for BackwardMany<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { tree, lu, rhs } = self;
-        for at in (0..rhs.stride()).step_by(2) {
+        for at in (0..rhs.stride()).step_by(WIDE) {
             match lu.s {
                 1 if S::SPECIALISE => backward_chunk::<S, 1>(simd, tree, lu, rhs, at, 1),
                 2 if S::SPECIALISE => backward_chunk::<S, 2>(simd, tree, lu, rhs, at, 2),
@@ -469,7 +469,7 @@ impl Kernel for BackwardMany<'_> {
     }
 }
 
-/// Root to leaves, eight columns at a time.
+/// Root to leaves, sixteen columns at a time.
 #[inline(always)]
 fn backward_chunk<S: Simd, const N: usize>(
     simd: S,

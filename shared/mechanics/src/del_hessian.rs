@@ -203,6 +203,14 @@ impl DelHessian {
         self.blocks[(pair * (self.s + 1) + alpha) * self.groups + gamma / LANES].0[gamma % LANES]
     }
 
+    /// The blocks `H_ij` and, unless they are their transposes, `H_ji` of a pair: rows α of `length / (s + 1)` quads over γ.
+    #[inline(always)]
+    pub(crate) fn pair_blocks(&self, pair: usize, length: usize) -> (&[Quad], Option<&[Quad]>) {
+        let range = pair * length..(pair + 1) * length;
+        let mirror = if self.mirror.is_empty() { None } else { Some(&self.mirror[range.clone()]) };
+        (&self.blocks[range], mirror)
+    }
+
     /// `H[α,γ]` with the branch coordinate as row and the joint of the body as column.
     #[inline(always)]
     pub(crate) fn mirrored(&self, pair: usize, alpha: usize, gamma: usize) -> f64 {

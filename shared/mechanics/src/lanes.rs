@@ -18,6 +18,8 @@ use crate::errors::ModelError;
 
 /// Lanes in a [`Quad`].
 pub(crate) const LANES: usize = 4;
+/// Quads in a [`WideLane`].
+pub(crate) const WIDE: usize = 4;
 
 /// Four doubles, one per control node.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -48,11 +50,11 @@ pub(crate) trait Simd: Copy {
     /// `c - a b`.
     fn neg_mul_add(self, a: Self::Lanes, b: Self::Lanes, c: Self::Lanes) -> Self::Lanes;
 
-    /// Eight doubles: two neighbouring quads of a row of right-hand sides.
+    /// Sixteen doubles: [`WIDE`] neighbouring quads of a row of right-hand sides.
     type Wide: Copy;
     fn wide_splat(self, x: f64) -> Self::Wide;
-    fn wide_load(self, quads: &[Quad; 2]) -> Self::Wide;
-    fn wide_store(self, wide: Self::Wide) -> [Quad; 2];
+    fn wide_load(self, quads: &[Quad; WIDE]) -> Self::Wide;
+    fn wide_store(self, wide: Self::Wide) -> [Quad; WIDE];
     /// `a b + c`.
     fn wide_mul_add(self, a: Self::Wide, b: Self::Wide, c: Self::Wide) -> Self::Wide;
     /// `c - a b`.
@@ -60,28 +62,38 @@ pub(crate) trait Simd: Copy {
 }
 
 /// The wide operations of an instruction set whose widest register is one [`Simd::Lanes`].
-macro_rules! wide_as_two_lanes {
+macro_rules! wide_as_four_lanes {
     () => {
-        type Wide = [Self::Lanes; 2];
+        type Wide = [Self::Lanes; 4];
         #[inline(always)]
         fn wide_splat(self, x: f64) -> Self::Wide {
-            [self.splat(x); 2]
+            [self.splat(x); 4]
         }
         #[inline(always)]
-        fn wide_load(self, quads: &[Quad; 2]) -> Self::Wide {
-            [self.load(&quads[0]), self.load(&quads[1])]
+        fn wide_load(self, q: &[Quad; WIDE]) -> Self::Wide {
+            [self.load(&q[0]), self.load(&q[1]), self.load(&q[2]), self.load(&q[3])]
         }
         #[inline(always)]
-        fn wide_store(self, wide: Self::Wide) -> [Quad; 2] {
-            [self.store(wide[0]), self.store(wide[1])]
+        fn wide_store(self, w: Self::Wide) -> [Quad; WIDE] {
+            [self.store(w[0]), self.store(w[1]), self.store(w[2]), self.store(w[3])]
         }
         #[inline(always)]
         fn wide_mul_add(self, a: Self::Wide, b: Self::Wide, c: Self::Wide) -> Self::Wide {
-            [self.mul_add(a[0], b[0], c[0]), self.mul_add(a[1], b[1], c[1])]
+            [
+                self.mul_add(a[0], b[0], c[0]),
+                self.mul_add(a[1], b[1], c[1]),
+                self.mul_add(a[2], b[2], c[2]),
+                self.mul_add(a[3], b[3], c[3]),
+            ]
         }
         #[inline(always)]
         fn wide_neg_mul_add(self, a: Self::Wide, b: Self::Wide, c: Self::Wide) -> Self::Wide {
-            [self.neg_mul_add(a[0], b[0], c[0]), self.neg_mul_add(a[1], b[1], c[1])]
+            [
+                self.neg_mul_add(a[0], b[0], c[0]),
+                self.neg_mul_add(a[1], b[1], c[1]),
+                self.neg_mul_add(a[2], b[2], c[2]),
+                self.neg_mul_add(a[3], b[3], c[3]),
+            ]
         }
     };
 }
@@ -97,7 +109,7 @@ fn zip(a: [f64; 4], b: [f64; 4], f: impl Fn(f64, f64) -> f64) -> [f64; 4] {
 
 impl Simd for Portable {
     const SPECIALISE: bool = false;
-    wide_as_two_lanes!();
+    wide_as_four_lanes!();
     type Lanes = [f64; 4];
     #[inline(always)]
     fn splat(self, x: f64) -> [f64; 4] {
@@ -136,7 +148,7 @@ impl Simd for Portable {
 #[cfg(target_arch = "x86_64")]
 impl Simd for pulp::x86::V3 {
     const SPECIALISE: bool = true;
-    wide_as_two_lanes!();
+    wide_as_four_lanes!();
     type Lanes = pulp::f64x4;
     #[inline(always)]
     fn splat(self, x: f64) -> pulp::f64x4 {
@@ -209,30 +221,38 @@ impl Simd for pulp::x86::V4 {
         self.negate_mul_add_f64x4(a, b, c)
     }
 
-    type Wide = pulp::f64x8;
+    type Wide = [pulp::f64x8; 2];
     #[inline(always)]
-    fn wide_splat(self, x: f64) -> pulp::f64x8 {
-        self.splat_f64x8(x)
+    fn wide_splat(self, x: f64) -> [pulp::f64x8; 2] {
+        [self.splat_f64x8(x); 2]
     }
     #[inline(always)]
-    fn wide_load(self, quads: &[Quad; 2]) -> pulp::f64x8 {
+    fn wide_load(self, q: &[Quad; WIDE]) -> [pulp::f64x8; 2] {
         // By registers: through memory, the wide load would wait for two narrow stores.
-        let low = self.avx512f._mm512_castpd256_pd512(pulp::cast(quads[0].0));
-        pulp::cast(self.avx512f._mm512_insertf64x4::<1>(low, pulp::cast(quads[1].0)))
+        let first = self.avx512f._mm512_castpd256_pd512(pulp::cast(q[0].0));
+        let second = self.avx512f._mm512_castpd256_pd512(pulp::cast(q[2].0));
+        [
+            pulp::cast(self.avx512f._mm512_insertf64x4::<1>(first, pulp::cast(q[1].0))),
+            pulp::cast(self.avx512f._mm512_insertf64x4::<1>(second, pulp::cast(q[3].0))),
+        ]
     }
     #[inline(always)]
-    fn wide_store(self, wide: pulp::f64x8) -> [Quad; 2] {
-        let wide = pulp::cast(wide);
-        let low = self.avx512f._mm512_castpd512_pd256(wide);
-        [Quad(pulp::cast(low)), Quad(pulp::cast(self.avx512f._mm512_extractf64x4_pd::<1>(wide)))]
+    fn wide_store(self, wide: [pulp::f64x8; 2]) -> [Quad; WIDE] {
+        let [first, second] = [pulp::cast(wide[0]), pulp::cast(wide[1])];
+        [
+            Quad(pulp::cast(self.avx512f._mm512_castpd512_pd256(first))),
+            Quad(pulp::cast(self.avx512f._mm512_extractf64x4_pd::<1>(first))),
+            Quad(pulp::cast(self.avx512f._mm512_castpd512_pd256(second))),
+            Quad(pulp::cast(self.avx512f._mm512_extractf64x4_pd::<1>(second))),
+        ]
     }
     #[inline(always)]
-    fn wide_mul_add(self, a: pulp::f64x8, b: pulp::f64x8, c: pulp::f64x8) -> pulp::f64x8 {
-        self.mul_add_f64x8(a, b, c)
+    fn wide_mul_add(self, a: Self::Wide, b: Self::Wide, c: Self::Wide) -> Self::Wide {
+        [self.mul_add_f64x8(a[0], b[0], c[0]), self.mul_add_f64x8(a[1], b[1], c[1])]
     }
     #[inline(always)]
-    fn wide_neg_mul_add(self, a: pulp::f64x8, b: pulp::f64x8, c: pulp::f64x8) -> pulp::f64x8 {
-        self.negate_mul_add_f64x8(a, b, c)
+    fn wide_neg_mul_add(self, a: Self::Wide, b: Self::Wide, c: Self::Wide) -> Self::Wide {
+        [self.negate_mul_add_f64x8(a[0], b[0], c[0]), self.negate_mul_add_f64x8(a[1], b[1], c[1])]
     }
 }
 
@@ -284,7 +304,7 @@ impl Instructions {
         }
     }
 
-    /// Runs a kernel that works on rows of eight: those gain from the widest registers, the others have four lanes anyway.
+    /// Runs a kernel that works on rows of sixteen: those gain from the widest registers, the others have four lanes anyway.
     #[inline(always)]
     pub fn dispatch_wide<K: Kernel>(self, kernel: K) -> K::Output {
         match self {
@@ -388,7 +408,7 @@ impl<S: Simd> Neg for Lane<S> {
     }
 }
 
-/// Eight doubles with their token, for rows of right-hand sides.
+/// Sixteen doubles with their token, for rows of right-hand sides.
 #[derive(Clone, Copy)]
 pub(crate) struct WideLane<S: Simd> {
     simd: S,
@@ -401,24 +421,24 @@ impl<S: Simd> WideLane<S> {
         Self { simd, wide: simd.wide_splat(x) }
     }
     #[inline(always)]
-    pub fn of(simd: S, quads: &[Quad; 2]) -> Self {
+    pub fn of(simd: S, quads: &[Quad; WIDE]) -> Self {
         Self { simd, wide: simd.wide_load(quads) }
     }
     #[inline(always)]
-    pub fn quads(self) -> [Quad; 2] {
+    pub fn quads(self) -> [Quad; WIDE] {
         self.simd.wide_store(self.wide)
     }
-    /// The two quads of `row` from `at` on; zero when the row is too short (which the callers rule out).
+    /// The quads of `row` from `at` on; zero when the row is too short (which the callers rule out).
     #[inline(always)]
     pub fn load(simd: S, row: &[Quad], at: usize) -> Self {
-        match row.get(at..).and_then(|rest| rest.first_chunk::<2>()) {
+        match row.get(at..).and_then(|rest| rest.first_chunk::<WIDE>()) {
             Some(quads) => Self { simd, wide: simd.wide_load(quads) },
             None => Self::splat(simd, 0.0),
         }
     }
     #[inline(always)]
     pub fn store(self, row: &mut [Quad], at: usize) {
-        if let Some(quads) = row.get_mut(at..).and_then(|rest| rest.first_chunk_mut::<2>()) {
+        if let Some(quads) = row.get_mut(at..).and_then(|rest| rest.first_chunk_mut::<WIDE>()) {
             *quads = self.simd.wide_store(self.wide);
         }
     }
@@ -434,8 +454,13 @@ impl<S: Simd> WideLane<S> {
     }
     #[inline(always)]
     pub fn is_zero(self) -> bool {
-        let [a, b] = self.simd.wide_store(self.wide);
-        a.0.iter().chain(&b.0).all(|x| *x == 0.0)
+        let mut zero = true;
+        for quad in self.quads() {
+            for x in quad.0 {
+                zero &= x == 0.0;
+            }
+        }
+        zero
     }
 }
 

@@ -15,7 +15,7 @@
 //! | equations | [`del_residual`], [`floating_base`] | Algorithm 1; rows of a floating base |
 //! | derivatives | [`tangent`], [`kinetic_hessian`], [`gravity_hessian`], [`del_hessian`] | Algorithm T, Algorithms 2 and 3, `H[α,γ]` |
 //! | Newton | [`newton_direction`], [`recursive_newton`], [`branch_lu`], [`dense_lu`], [`step`] | Algorithm B.1 and its rivals; the step |
-//! | use | [`linearize`], [`constraints`], [`velocity`] | `A`, `B`; points, loops, welds; velocities from momenta |
+//! | use | [`linearize`], [`recursive_linearize`], [`constraints`], [`velocity`] | `A`, `B`; points, loops, welds; velocities from momenta |
 //! | horizon | [`stage_batch`] | lifted linearisation of many stages at once, a SIMD lane each |
 //! | classics | [`kinematics`], [`mass_matrix`], [`mass_matrix_factor`], [`inverse_dynamics`], [`energy`] | continuous mechanics |
 //!
@@ -76,7 +76,7 @@ pub mod mass_matrix;
 pub mod mass_matrix_factor;
 pub mod newton_direction;
 pub(crate) mod real;
-pub(crate) mod recursive_linearize;
+pub mod recursive_linearize;
 pub mod recursive_newton;
 pub mod reroot;
 pub mod row_matrix;

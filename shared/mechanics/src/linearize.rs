@@ -18,9 +18,10 @@
 //! **(q, q̇).** At step boundaries `p = M(q) q̇`, so `δp = K_q̇q δq + M δq̇` and `A' = T_{k+1}⁻¹ A T_k`, `B' = T_{k+1}⁻¹ B` with
 //! `T = [1 0; K_q̇q M]`. The change of coordinates is folded into the right-hand sides and the last row.
 //!
-//! **Two paths.** The matrix path solves all columns at once with the Hessian blocks, O(n Σ depth): fastest up to about
-//! n = 60. The strict O(n²) path takes one Algorithm T, one solve and one Algorithm T per column
-//! ([`Linearizer::linearize_by_tangent`]); it also serves the floating base.
+//! **Three paths.** The matrix path solves all columns at once with the Hessian blocks, O(n Σ depth): fastest for trees of short
+//! branches. The recursion over columns ([`Linearizer::linearize_by_recursion`]) is O(n²) for any tree: fastest for long branches.
+//! The tangent path takes one Algorithm T, one solve and one Algorithm T per column, also O(n²) but column by column
+//! ([`Linearizer::linearize_by_tangent`]); it serves the floating base and checks the others.
 //!
 //! **Floating base.** Coordinates are minimal and canonical: `x = (ε, δq, δπ, δp_j)` with the pose error `δg = g ε^` and
 //! `δπ = Ad_gᵀ(δP + ½ ad^D_P η)`; the ½-term makes the symplectic form constant, so again `AᵀΩA = Ω`.
@@ -34,7 +35,7 @@ use crate::del_hessian::DelHessian;
 use crate::del_residual::DelWorkspace;
 use crate::errors::{ModelError, StepError};
 use crate::kinetic_hessian::KineticHessian;
-use crate::lanes::{Kernel, Simd, WideLane};
+use crate::lanes::{Kernel, LANES, Simd, WIDE, WideLane};
 use crate::mass_matrix_factor::MassMatrixFactor;
 use crate::newton_direction::{NewtonDirection, NewtonSolver};
 use crate::recursive_linearize::{AllColumns, ColumnSweeps};
@@ -44,6 +45,12 @@ use crate::spatial::{RigidTransform, Twist, Wrench};
 use crate::step::Integrator;
 use crate::tangent::{StartVariation, TangentWorkspace};
 use crate::tree::KinematicTree;
+
+/// Mean length of the branches above which the recursion over columns beats the matrix path, for s = 1, 2, 3 and more.
+///
+/// Measured with `benches/crossover.rs` (Xeon with AVX-512; chains and stars of 8 to 125 links): equal at 15 to 22 for s = 1, 9 to 13 for
+/// s = 2, 16 to 20 for s = 3. Atlas on its foot has 9.8.
+const CROSSOVER_LINEARIZATION: [f64; 3] = [18.0, 12.5, 18.0];
 
 /// State of the linearised dynamics.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -117,6 +124,8 @@ pub struct Linearizer {
     tangent: TangentWorkspace,
     /// Algorithm B.1 for whole steps: fixed base in momentum coordinates, without general wrenches.
     recursive: Option<(RecursiveNewton, ColumnSweeps)>,
+    /// Whether the tree is deep enough for it.
+    deep: bool,
     column: Vec<f64>,
     momentum: Vec<f64>,
 }
@@ -157,13 +166,18 @@ impl Linearizer {
             velocities: [vec![0.0; n], vec![0.0; n]],
             tangent: TangentWorkspace::new(tree, del),
             recursive,
+            deep: {
+                let sum: usize = (0..tree.body_count()).map(|i| tree.branch(i).len()).sum();
+                let limit = CROSSOVER_LINEARIZATION[s.clamp(1, CROSSOVER_LINEARIZATION.len()) - 1];
+                sum as f64 > limit * tree.body_count() as f64
+            },
             column: vec![0.0; s * n],
             momentum: vec![0.0; n],
         })
     }
 
-    /// `A` and `B` around the step that `integrator` has just solved ([`Integrator::solve`] or [`Integrator::step`]).
-    /// Factorises the Newton matrix at the solution. No allocation. Fixed base: O(n Σ depth); floating base: the O(n²) path.
+    /// `A` and `B` around the step that `integrator` has just solved ([`Integrator::solve`] or [`Integrator::step`]), by the path that
+    /// is fastest for the tree. Factorises the Newton matrix at the solution. No allocation.
     ///
     /// # Errors
     /// [`StepError::Singular`] when a factorisation fails.
@@ -173,7 +187,26 @@ impl Linearizer {
         integrator: &mut Integrator,
     ) -> Result<&LinearStep, StepError> {
         if tree.is_floating() {
-            return self.linearize_by_tangent(tree, integrator);
+            self.linearize_by_tangent(tree, integrator)
+        } else if self.recursive.is_some() && self.deep {
+            self.linearize_by_recursion(tree, integrator)
+        } else {
+            self.linearize_by_matrix(tree, integrator)
+        }
+    }
+
+    /// The matrix path, O(n Σ depth): all columns at once with the Hessian blocks. Fixed base, either coordinates.
+    ///
+    /// # Errors
+    /// [`StepError::Singular`] when a factorisation fails; [`ModelError::Unsupported`] for a floating base.
+    pub fn linearize_by_matrix(
+        &mut self,
+        tree: &KinematicTree,
+        integrator: &mut Integrator,
+    ) -> Result<&LinearStep, StepError> {
+        if tree.is_floating() {
+            let reason = "the matrix path is for a fixed base";
+            return Err(ModelError::Unsupported { body: 0, reason }.into());
         }
         if self.coordinates == StateCoordinates::Velocity {
             self.evaluate_velocities(tree, integrator)?;
@@ -538,18 +571,18 @@ impl Kernel for EndRows<'_> {
     type Output = ();
     #[inline(always)]
     fn run<S: Simd>(mut self, simd: S) {
-        for at in (0..self.z.stride()).step_by(2) {
-            match self.s {
-                1 if S::SPECIALISE => end_chunk(simd, &mut self, at, 1),
-                2 if S::SPECIALISE => end_chunk(simd, &mut self, at, 2),
-                s => end_chunk(simd, &mut self, at, s),
+        for at in (0..self.z.stride()).step_by(WIDE) {
+            match (self.s, self.hessian.groups) {
+                (1, 1) if S::SPECIALISE => end_chunk(simd, &mut self, at, 1, 1),
+                (2, 1) if S::SPECIALISE => end_chunk(simd, &mut self, at, 2, 1),
+                (s, groups) => end_chunk(simd, &mut self, at, s, groups),
             }
         }
     }
 }
 
 #[inline(always)]
-fn end_chunk<S: Simd>(simd: S, work: &mut EndRows<'_>, at: usize, s: usize) {
+fn end_chunk<S: Simd>(simd: S, work: &mut EndRows<'_>, at: usize, s: usize, groups: usize) {
     let (tree, hessian) = (work.tree, work.hessian);
     let stride = work.z.stride();
     let z = work.z.quads();
@@ -566,6 +599,7 @@ fn end_chunk<S: Simd>(simd: S, work: &mut EndRows<'_>, at: usize, s: usize) {
         for (position, &j) in tree.branch(i).iter().enumerate() {
             let j = j as usize;
             let pair = first + position;
+            let (block, mirror) = hessian.pair_blocks(pair, (s + 1) * groups);
             let (mut own_rate, mut other_rate) = (0.0, 0.0);
             if let Some(kinetic) = work.kinetic {
                 let terms = kinetic.pair(i, position);
@@ -574,8 +608,11 @@ fn end_chunk<S: Simd>(simd: S, work: &mut EndRows<'_>, at: usize, s: usize) {
             let target = (n + j) * stride + at;
             let mut moved = WideLane::load(simd, out, target);
             for gamma in 1..=s {
-                let mut ahead = hessian.entry(pair, s, gamma);
-                let mut behind = hessian.mirrored(pair, s, gamma);
+                let mut ahead = block[s * groups + gamma / LANES].0[gamma % LANES];
+                let mut behind = match mirror {
+                    Some(mirror) => mirror[s * groups + gamma / LANES].0[gamma % LANES],
+                    None => block[gamma * groups + s / LANES].0[s % LANES],
+                };
                 if gamma == s {
                     ahead -= own_rate;
                     behind -= other_rate;
@@ -608,7 +645,7 @@ impl Kernel for SolveMass<'_> {
         let stride = out.stride();
         let n = factor.pivots().len();
         let out = out.quads_mut();
-        for at in (0..stride).step_by(2) {
+        for at in (0..stride).step_by(WIDE) {
             let row = |k: usize| (n + k) * stride + at;
             for k in (0..n).rev() {
                 let own = WideLane::load(simd, out, row(k));

@@ -14,6 +14,7 @@ use crate::del_hessian::DelHessian;
 use crate::del_residual::DelWorkspace;
 use crate::dense_lu::DenseNewton;
 use crate::errors::FactorError;
+use crate::lobatto::MAX_UNKNOWN_NODES;
 use crate::recursive_newton::RecursiveNewton;
 use crate::row_matrix::RowMatrix;
 use crate::spatial::{Twist, Wrench};
@@ -54,8 +55,9 @@ pub enum NewtonMethod {
 
 /// Root-mean-square depth above which Algorithm B.1 beats the branch LU, for s = 1, 2, 3, 4 and more.
 ///
-/// Measured on chains and binary trees with `benches/newton_direction.rs`.
-const CROSSOVER_DEPTH: [f64; 4] = [40.0, 40.0, 40.0, 40.0];
+/// Measured with `benches/crossover.rs` (Xeon with AVX-512; chains and stars of 8 to 125 links): factor and solve cost the same at depth 6
+/// to 7 for s = 1, 14 to 15 for s = 2, 19 to 28 for s = 3, 12 to 15 for s = 4. Atlas on its foot has 10.6.
+const CROSSOVER_DEPTH: [f64; 4] = [6.5, 14.5, 23.0, 14.0];
 
 impl NewtonMethod {
     /// The faster one for a tree and a number of unknown nodes, by measured crossover of the depth.
@@ -173,18 +175,17 @@ pub(crate) fn jacobian_column_rule(
     let curved =
         second_order_matrix(del, s, &momentum_end) - second_order_matrix(del, 0, &del.start_momentum());
     let last_column = end_twists.tr_mul(&(shifted_impulse + turned)) + curved;
-    let shift_at = |alpha: usize| {
-        let rows = Matrix6::from_fn(|k, c| hessian.shift_row(k, alpha)[c]);
-        rows * start_twists
-    };
-    let (shift_first, shift_last) = (shift_at(0), shift_at(s));
+    let mut shifts = [Matrix6::zeros(); MAX_UNKNOWN_NODES + 1];
+    for (alpha, shift) in shifts.iter_mut().enumerate().take(s + 1) {
+        *shift = Matrix6::from_fn(|k, c| hessian.shift_row(k, alpha)[c]) * start_twists;
+    }
     for k in 0..6 {
         for l in 0..6 {
             for gamma in 1..=s {
                 for alpha in 1..s {
                     let mut value = hessian.base_entry(k, l, alpha, gamma);
                     if gamma == s {
-                        value += shift_at(alpha)[(k, l)] - hessian.base_entry(k, l, alpha, 0);
+                        value += shifts[alpha][(k, l)] - hessian.base_entry(k, l, alpha, 0);
                     }
                     put(k * s + alpha, l * s + gamma - 1, BaseEntry::Set(value));
                 }
@@ -192,8 +193,8 @@ pub(crate) fn jacobian_column_rule(
                 let mut value = hessian.base_entry(k, l, 0, gamma) - hessian.base_entry(k, l, s, gamma)
                     + end_twists.column(k).dot(&impulse);
                 if gamma == s {
-                    value += last_column[(k, l)] + shift_first[(k, l)]
-                        - shift_last[(k, l)]
+                    value += last_column[(k, l)] + shifts[0][(k, l)]
+                        - shifts[s][(k, l)]
                         - (hessian.base_entry(k, l, 0, 0) - hessian.base_entry(k, l, s, 0));
                 }
                 put(k * s, l * s + gamma - 1, BaseEntry::Set(value));

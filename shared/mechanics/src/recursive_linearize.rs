@@ -28,8 +28,8 @@ use alloc::vec::Vec;
 
 use crate::del_residual::{DelWorkspace, load_arm};
 use crate::lanes::{
-    Kernel, LANES, Lane, Lane3, Lane6, Quad, Simd, WideLane, add, cross, dual_bracket, halves, join, load,
-    mat_tr_vec, mat_vec, scale, splat, store, sub,
+    Kernel, LANES, Lane, Lane3, Lane6, Quad, Simd, WIDE, WideLane, add, cross, dual_bracket, halves, join,
+    load, mat_tr_vec, mat_vec, scale, splat, store, sub,
 };
 use crate::linearize::InputHold;
 use crate::recursive_newton::{Interface, JointNodes, MAX_NODES, arm_cross_force, assign_slots, dot};
@@ -311,36 +311,32 @@ fn add_force<S: Simd>(sum: &mut [Lane<S>; 12], arm: Lane3<S>, force: Lane3<S>, c
 /// Sixteen columns of one quantity.
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
-struct Tile([[Quad; 2]; 2]);
+struct Tile([Quad; WIDE]);
 
 impl Tile {
-    const COLUMNS: usize = 4 * LANES;
-    const ZERO: Self = Self([[Quad::ZERO; 2]; 2]);
+    const COLUMNS: usize = WIDE * LANES;
+    const ZERO: Self = Self([Quad::ZERO; WIDE]);
 
     #[inline(always)]
     fn add_to_lane(&mut self, lane: usize, value: f64) {
-        self.0[lane / (2 * LANES)][lane / LANES % 2].0[lane % LANES] += value;
+        self.0[lane / LANES].0[lane % LANES] += value;
     }
 }
 
-/// A [`Tile`] in registers.
-type Wide<S> = [WideLane<S>; 2];
-
 #[inline(always)]
-fn get<S: Simd>(simd: S, tile: &Tile) -> Wide<S> {
-    [WideLane::of(simd, &tile.0[0]), WideLane::of(simd, &tile.0[1])]
+fn get<S: Simd>(simd: S, tile: &Tile) -> WideLane<S> {
+    WideLane::of(simd, &tile.0)
 }
 
 #[inline(always)]
-fn put<S: Simd>(value: Wide<S>) -> Tile {
-    Tile([value[0].quads(), value[1].quads()])
+fn put<S: Simd>(value: WideLane<S>) -> Tile {
+    Tile(value.quads())
 }
 
 /// `factor x + y`.
 #[inline(always)]
-fn mul_add<S: Simd>(simd: S, factor: f64, x: Wide<S>, y: Wide<S>) -> Wide<S> {
-    let factor = WideLane::splat(simd, factor);
-    [factor.mul_add(x[0], y[0]), factor.mul_add(x[1], y[1])]
+fn mul_add<S: Simd>(simd: S, factor: f64, x: WideLane<S>, y: WideLane<S>) -> WideLane<S> {
+    WideLane::splat(simd, factor).mul_add(x, y)
 }
 
 /// What a column varies, and where.
@@ -485,7 +481,7 @@ fn place_starts(work: &mut AllColumns<'_>, first: usize) {
 fn inward<S: Simd, const N: usize>(simd: S, work: &mut AllColumns<'_>, first: usize, shape: &Interface) {
     let (s, no) = (shape.s, shape.outputs());
     let lengths = Lengths::new(shape);
-    let zero = [WideLane::splat(simd, 0.0); 2];
+    let zero = WideLane::splat(simd, 0.0);
     let momenta = 6 * (s + 1);
     for i in (0..work.tree.body_count()).rev() {
         if !work.sweeps.reached[i] {
@@ -605,7 +601,7 @@ fn inward<S: Simd, const N: usize>(simd: S, work: &mut AllColumns<'_>, first: us
 fn outward<S: Simd, const N: usize>(simd: S, work: &mut AllColumns<'_>, first: usize, shape: &Interface) {
     let (s, ni) = (shape.s, shape.inputs());
     let lengths = Lengths::new(shape);
-    let zero = [WideLane::splat(simd, 0.0); 2];
+    let zero = WideLane::splat(simd, 0.0);
     let (n, stride) = (work.tree.dof(), work.out.stride());
     let quad = first / LANES;
     for i in 0..work.tree.body_count() {
@@ -659,13 +655,8 @@ fn outward<S: Simd, const N: usize>(simd: S, work: &mut AllColumns<'_>, first: u
             momentum = mul_add(simd, end_by_x[gamma], x[gamma], momentum);
         }
         let out = work.out.quads_mut();
-        for half in 0..2 {
-            // The last tile may be half a tile.
-            if quad + 2 * half < stride {
-                x[s - 1][half].store(out, i * stride + quad + 2 * half);
-                momentum[half].store(out, (n + i) * stride + quad + 2 * half);
-            }
-        }
+        x[s - 1].store(out, i * stride + quad);
+        momentum.store(out, (n + i) * stride + quad);
         let slot = work.sweeps.input_slot[i];
         if slot != NONE {
             let own = slot * (ni + 3);

@@ -3,9 +3,9 @@
 use alloc::vec;
 use alloc::vec::Vec;
 
-use crate::lanes::{LANES, Quad};
+use crate::lanes::{LANES, Quad, WIDE};
 
-/// Row-major dense matrix; rows are padded to a multiple of eight doubles (the padding is scratch).
+/// Row-major dense matrix; rows are padded to a multiple of sixteen doubles (the padding is scratch).
 #[derive(Clone, Debug)]
 pub struct RowMatrix {
     rows: usize,
@@ -17,7 +17,7 @@ pub struct RowMatrix {
 impl RowMatrix {
     /// A zero matrix.
     pub fn zeros(rows: usize, columns: usize) -> Self {
-        let stride = 2 * columns.div_ceil(2 * LANES);
+        let stride = WIDE * columns.div_ceil(WIDE * LANES);
         Self { rows, columns, stride, data: vec![Quad::ZERO; rows * stride] }
     }
 

@@ -8,7 +8,7 @@
 //! | `θ` | contraction: size of a change relative to the one before |
 //!
 //! **Start.** The interpolation polynomial of the step before is extrapolated, `q^α := Σ_β l_β(1 + c_α) q_prev^β`, when the step
-//! continues where the last one ended; else `q^α = q^0 + c_α Δt M⁻¹p`; if Newton fails from there, `q^α = q^0`.
+//! continues where the last one ended (a floating base: in the chart of the last step, then moved to the new one); else `q^α = q^0 + c_α Δt M⁻¹p`; if Newton fails from there, `q^α = q^0`.
 //!
 //! **Iteration.** `J` is factorised at the start and kept while the iteration contracts (simplified Newton); Broyden's update
 //! on top of the factors costs a few scalar products and saves about one iteration. `J` is renewed when `θ` exceeds
@@ -24,6 +24,7 @@
 
 use alloc::vec;
 use alloc::vec::Vec;
+use nalgebra::Vector3;
 
 use crate::del_residual::{DelWorkspace, ForceCapacity};
 use crate::dense_lu::DenseNewton;
@@ -33,6 +34,7 @@ use crate::forces::StepForces;
 use crate::lobatto::LobattoRule;
 use crate::newton_direction::{NewtonDirection, NewtonMethod, NewtonSolver};
 use crate::real::sqrt;
+use crate::spatial::{RigidTransform, exp_rotation, log_rotation};
 use crate::state::State;
 use crate::tree::{JointKind, KinematicTree};
 use crate::velocity::VelocityWorkspace;
@@ -137,6 +139,8 @@ pub struct Integrator {
     /// Nodes of the last step, coordinate-major, and the state it ended in.
     previous_nodes: Vec<f64>,
     previous_end: State,
+    /// Chart centre of a floating base in the last step.
+    previous_center: RigidTransform,
     has_previous: bool,
     /// Where the guess put node s.
     guessed_end: Vec<f64>,
@@ -178,6 +182,7 @@ impl Integrator {
             extrapolation,
             previous_nodes: vec![0.0; (s + 1) * tree.dof()],
             previous_end: State::zeros(tree),
+            previous_center: RigidTransform::identity(),
             has_previous: false,
             guessed_end: vec![0.0; tree.dof()],
             changes: vec![0.0; BROYDEN_MEMORY * order],
@@ -277,14 +282,42 @@ impl Integrator {
         for dof in 0..tree.dof() {
             let nodes = &self.previous_nodes[dof * count..(dof + 1) * count];
             for alpha in 1..count {
-                let value = if dof < tree.base_dof() {
-                    // The chart moves with the body: the same rotation and travel once more.
-                    nodes[alpha]
-                } else {
-                    let row = &self.extrapolation[alpha * count..(alpha + 1) * count];
-                    row.iter().zip(nodes).map(|(l, q)| l * q).sum()
-                };
+                let row = &self.extrapolation[alpha * count..(alpha + 1) * count];
+                let value = row.iter().zip(nodes).map(|(l, q)| l * q).sum();
                 self.del.set_node(alpha, dof, value);
+            }
+        }
+        if tree.is_floating() {
+            self.move_guess_to_new_chart();
+        }
+    }
+
+    /// The guess of a floating base is in the chart of the last step: the same poses in the chart of this step.
+    fn move_guess_to_new_chart(&mut self) {
+        let s = self.del.unknown_nodes();
+        let start = self.del.start.base_pose;
+        let vector = |del: &DelWorkspace, alpha: usize, at: usize| {
+            Vector3::new(del.node(alpha, at), del.node(alpha, at + 1), del.node(alpha, at + 2))
+        };
+        let pose = |del: &DelWorkspace, alpha: usize| {
+            let motion = RigidTransform {
+                rotation: exp_rotation(&vector(del, alpha, 0)),
+                translation: vector(del, alpha, 3),
+            };
+            self.previous_center * motion
+        };
+        let end = pose(&self.del, s);
+        let turn = log_rotation(&start.rotation.tr_mul(&end.rotation)) * 0.5;
+        let center = RigidTransform {
+            rotation: start.rotation * exp_rotation(&turn),
+            translation: (start.translation + end.translation) * 0.5,
+        };
+        for alpha in 1..=s {
+            let motion = center.inverse() * pose(&self.del, alpha);
+            let omega = log_rotation(&motion.rotation);
+            for k in 0..3 {
+                self.del.set_node(alpha, k, omega[k]);
+                self.del.set_node(alpha, 3 + k, motion.translation[k]);
             }
         }
     }
@@ -310,12 +343,12 @@ impl Integrator {
 
     /// Half a step of the base at constant body velocity, in the chart centred in the middle of the step.
     fn half_motion(&self, state: &State) -> [f64; 6] {
-        let vector = |at: usize| nalgebra::Vector3::new(self.rate[at], self.rate[at + 1], self.rate[at + 2]);
+        let vector = |at: usize| Vector3::new(self.rate[at], self.rate[at + 1], self.rate[at + 2]);
         let (omega, linear) = (vector(0), vector(3));
         let pose = &state.base_pose;
         let half = 0.5 * self.del.time_step();
         let turn = pose.rotation.tr_mul(&omega) * half;
-        let center = pose.rotation * crate::spatial::exp_rotation(&turn);
+        let center = pose.rotation * exp_rotation(&turn);
         let travel = center.tr_mul(&(linear + omega.cross(&pose.translation))) * half;
         [turn.x, turn.y, turn.z, travel.x, travel.y, travel.z]
     }
@@ -472,6 +505,7 @@ impl Integrator {
             }
         }
         self.previous_end.copy_from(&self.next);
+        self.previous_center = self.del.center;
         self.has_previous = true;
         Ok(report)
     }

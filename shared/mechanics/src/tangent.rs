@@ -207,7 +207,7 @@ impl Kernel for SecondOrderAt<'_> {
         let (g, lane) = (self.alpha / LANES, self.alpha % LANES);
         let wrench: [f64; 6] = self.wrench.to_vector().into();
         let n = second_order(simd, &self.del.base[g], crate::lanes::splat(simd, &wrench));
-        let dq: Lane6<S> = load_strided(simd, &self.dq, g, self.del.groups);
+        let dq: Lane6<S> = load_strided(simd, self.dq, g, self.del.groups);
         store(apply_second_order(&n, dq)).map(|q| q.0[lane])
     }
 }

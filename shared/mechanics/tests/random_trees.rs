@@ -552,6 +552,8 @@ fn a_and_b_come_out_the_same_by_both_paths_and_every_factorisation() {
             };
             let by_matrix = columns(work.linearize(&robot.tree, &mut integrator).unwrap());
             let by_tangent = columns(work.linearize_by_tangent(&robot.tree, &mut integrator).unwrap());
+            // Refused for a floating base and for general wrenches.
+            let by_recursion = work.linearize_by_recursion(&robot.tree, &mut integrator).map(columns);
             let want = reference.get_or_insert(by_tangent.clone());
             for (c, want) in want.iter().enumerate() {
                 let matrix = relative(&by_matrix[c], want);
@@ -566,6 +568,13 @@ fn a_and_b_come_out_the_same_by_both_paths_and_every_factorisation() {
                     tangent,
                     SAME_LINEARISATION,
                 )?);
+                if let Ok(by_recursion) = &by_recursion {
+                    worst = worst.max(within(
+                        &format!("recursion column {c}"),
+                        relative(&by_recursion[c], want),
+                        SAME_LINEARISATION,
+                    )?);
+                }
             }
             if robot.tree.is_floating() {
                 continue;

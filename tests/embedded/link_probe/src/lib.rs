@@ -148,3 +148,14 @@ pub unsafe extern "C" fn delmpc_probe_cycle(probe: *mut Probe) -> f64 {
         Err(_) => f64::NAN,
     }
 }
+
+/// The leak that check.sh must find.
+#[cfg(feature = "leak")]
+#[unsafe(no_mangle)]
+pub extern "C" fn delmpc_probe_leak() -> *mut u8 {
+    unsafe extern "C" {
+        fn malloc(size: usize) -> *mut u8;
+    }
+    // SAFETY: malloc takes any size.
+    unsafe { malloc(1) }
+}
