@@ -45,6 +45,11 @@ impl RobotController {
         controller.set_origin_ns(0);
         Ok(Self { controller, realtime: setup.scenario.clock == Clock::Realtime })
     }
+
+    /// The controller itself: its plan, its model, its problem.
+    pub fn core(&self) -> &core::Controller {
+        &self.controller
+    }
 }
 
 impl Controller for RobotController {
