@@ -22,6 +22,7 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, Compression, WriteOptions, Writer};
 
 use crate::log_viewer::{self, LogViewer};
+use crate::steering::Pull;
 use crate::truth::Truth;
 use crate::verdict::Failure;
 
@@ -34,6 +35,8 @@ const ENCAPSULATION: [u8; 4] = [0, 1, 0, 0];
 pub const STATE: &str = "/plant/state";
 /// Commands as the plant received them; each holds the report of its cycle.
 pub const COMMAND: &str = "/controller/command";
+/// Pulls of a person: from when on, where, how strong.
+pub const PULL: &str = "/plant/pull";
 /// What really happened.
 pub const TRUTH: &str = "/plant/truth";
 
@@ -52,6 +55,7 @@ enum Record {
     State(PlantState),
     Command(Command),
     Truth(Truth),
+    Pull(Pull),
 }
 
 /// The loop's end of the log.
@@ -113,6 +117,11 @@ impl Log {
         self.put(truth.time_ns, || Record::Truth(*truth));
     }
 
+    /// Logs a pull that begins, changes or ends.
+    pub fn pull(&mut self, pull: &Pull) {
+        self.put(pull.time_ns, || Record::Pull(*pull));
+    }
+
     fn put(&mut self, time_ns: u64, record: impl FnOnce() -> Record) {
         let Some(queue) = &self.queue else { return };
         let sent = match self.waits {
@@ -144,6 +153,7 @@ struct Channels {
     state: u16,
     command: u16,
     truth: u16,
+    pull: u16,
     viewer: BTreeMap<&'static str, u16>,
 }
 
@@ -168,6 +178,7 @@ impl Channels {
             state: add(STATE, "delmpc_msgs/msg/PlantState", &plant_state_schema())?,
             command: add(COMMAND, "delmpc_msgs/msg/Command", &command_schema())?,
             truth: add(TRUTH, "delmpc_msgs/msg/Truth", TRUTH_FIELDS)?,
+            pull: add(PULL, "delmpc_msgs/msg/Pull", PULL_FIELDS)?,
             viewer,
         })
     }
@@ -192,6 +203,7 @@ fn write_all(
             Record::State(state) => (channels.state, bytes_of(state)),
             Record::Command(command) => (channels.command, bytes_of(command)),
             Record::Truth(truth) => (channels.truth, bytes_of(truth)),
+            Record::Pull(pull) => (channels.pull, bytes_of(pull)),
         };
         bytes.clear();
         bytes.extend_from_slice(&ENCAPSULATION);
@@ -309,6 +321,14 @@ float64[3] push_force_w
 float64 energy_balance_error
 ";
 
+const PULL_FIELDS: &str = "\
+uint64 time_ns
+uint32 body
+uint32 acts
+float64[3] point_b
+float64[3] force_w
+";
+
 fn plant_state_schema() -> String {
     format!("{PLANT_STATE_FIELDS}{SEPARATOR}MSG: delmpc_msgs/Header\n{HEADER_FIELDS}")
 }
@@ -385,6 +405,7 @@ mod tests {
                 worst_constraint, worst_stage, worst_row, qp_solves, qp_iterations, active_rows, dropped_rows, allocations,
             ]
         );
+        assert_layout!(Pull, PULL_FIELDS, [time_ns, body, acts, point_b, force_w]);
         assert_layout!(
             Truth,
             TRUTH_FIELDS,

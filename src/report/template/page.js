@@ -65,8 +65,8 @@ class Page {
       `robot ${run.robot.name}, ${run.robot.mass_kg.toFixed(1)} kg`,
       run.timed ? "real time, two processes" : "lockstep",
       `seed ${run.seed}`,
-      `${(frames.end - frames.begin).toFixed(1)} s simulated`,
-      `${cycles.rows ? figures?.cycles ?? cycles.rows : 0} control cycles`,
+      `${(frames.rows ? frames.end - frames.begin : run.duration_s).toFixed(1)} s simulated`,
+      figures ? `${figures.cycles ?? cycles.rows} control cycles` : null,
       about.program,
       about.git_revision ? `git ${about.git_revision.slice(0, 12)}` : null,
     ];
@@ -95,9 +95,6 @@ class Page {
 
   transport() {
     const slider = $("time");
-    const whole = () => { slider.min = frames.begin; slider.max = this.axis.wholeTo ?? Math.max(frames.end, frames.begin + 1e-3); };
-    whole();
-    this.resizeTime = whole;
     slider.addEventListener("input", () => { this.stop(); this.seek(+slider.value); });
     $("play").addEventListener("click", () => (this.playing ? this.stop() : this.play()));
     document.addEventListener("keydown", (event) => {
@@ -106,6 +103,13 @@ class Page {
       if (event.key === " ") { event.preventDefault(); if (this.playing) this.stop(); else this.play(); }
       if (step) { event.preventDefault(); this.stop(); this.seek(this.time + step * (event.shiftKey ? 10 : 1)); }
     });
+    this.timeline();
+  }
+
+  // Slider, marks and ranges of what there is.
+  timeline() {
+    $("time").min = frames.begin;
+    $("time").max = Math.max(frames.end, frames.begin + 1e-3);
     const end = Math.max(frames.end, run.duration_s ?? 0.001);
     $("marks").replaceChildren(...run.events.map(({ kind, label, from, to }) =>
       element("span", { class: kind, title: label, style: `left:${(100 * from) / end}%;width:${Math.max(0.4, (100 * (to - from)) / end)}%` })));
