@@ -47,7 +47,8 @@ struct Eye {
 impl Eye {
     fn new() -> Self {
         let right = Vector3::new(-AZIMUTH.sin(), AZIMUTH.cos(), 0.0);
-        let back = Vector3::new(ELEVATION.cos() * AZIMUTH.cos(), ELEVATION.cos() * AZIMUTH.sin(), ELEVATION.sin());
+        let back =
+            Vector3::new(ELEVATION.cos() * AZIMUTH.cos(), ELEVATION.cos() * AZIMUTH.sin(), ELEVATION.sin());
         Self { right, up: back.cross(&right), back }
     }
 
@@ -62,19 +63,26 @@ impl Eye {
 /// # Errors
 /// When a posture does not fit the tree.
 pub fn drawing(robot: &RobotModel) -> Result<String, ModelError> {
-    let zero = Posture { name: "all joints at zero".to_owned(), base_link_pose_w: None, q: vec![0.0; robot.joint_names.len()] };
+    let zero = Posture {
+        name: "all joints at zero".to_owned(),
+        base_link_pose_w: None,
+        q: vec![0.0; robot.joint_names.len()],
+    };
     let postures = if robot.postures.is_empty() { std::slice::from_ref(&zero) } else { &robot.postures };
     let eye = Eye::new();
     let mut figures = Vec::new();
     for posture in postures {
         let mut pieces = pieces(robot, posture)?;
         pieces.retain(|piece| piece.normal.dot(&eye.back) > 0.0);
-        let depth = |piece: &Piece| piece.corners.iter().sum::<Vector3<f64>>().dot(&eye.back) / piece.corners.len() as f64;
+        let depth = |piece: &Piece| {
+            piece.corners.iter().sum::<Vector3<f64>>().dot(&eye.back) / piece.corners.len() as f64
+        };
         pieces.sort_by(|a, b| depth(a).total_cmp(&depth(b)));
         figures.push((posture.name.as_str(), pieces));
     }
     let bounds = figures.iter().map(|(_, pieces)| Bounds::of(pieces, &eye)).collect::<Vec<_>>();
-    let largest = bounds.iter().fold(Vector2::new(0.1, 0.1), |size: Vector2<f64>, bounds| size.sup(&bounds.size()));
+    let largest =
+        bounds.iter().fold(Vector2::new(0.1, 0.1), |size: Vector2<f64>, bounds| size.sup(&bounds.size()));
     let scale = HEIGHT / largest.y.max(0.5 * largest.x);
     let cell = Vector2::new(largest.x * scale + 2.0 * ROOM, largest.y * scale + ROOM + CAPTION);
     let columns = figures.len().min(COLUMNS);
@@ -94,10 +102,14 @@ pub fn drawing(robot: &RobotModel) -> Result<String, ModelError> {
         escaped(&robot.name)
     );
     for (index, ((name, pieces), bounds)) in figures.iter().zip(&bounds).enumerate() {
-        let corner = Vector2::new((index % columns) as f64 * cell.x, TITLE + (index / columns) as f64 * cell.y);
+        let corner =
+            Vector2::new((index % columns) as f64 * cell.x, TITLE + (index / columns) as f64 * cell.y);
         // Feet of all postures at the same height.
         let shift = corner
-            + Vector2::new(cell.x / 2.0 - scale * (bounds.low.x + bounds.high.x) / 2.0, cell.y - CAPTION - scale * bounds.high.y);
+            + Vector2::new(
+                cell.x / 2.0 - scale * (bounds.low.x + bounds.high.x) / 2.0,
+                cell.y - CAPTION - scale * bounds.high.y,
+            );
         let _ = writeln!(text, "<g stroke-linejoin=\"round\" stroke-width=\"1.1\">");
         for piece in pieces {
             let points = piece.corners.iter().map(|corner| {
@@ -131,7 +143,11 @@ impl Bounds {
         let points = pieces.iter().flat_map(|piece| &piece.corners).map(|corner| eye.see(corner));
         let start = (Vector2::repeat(f64::INFINITY), Vector2::repeat(f64::NEG_INFINITY));
         let (low, high) = points.fold(start, |(low, high), point| (low.inf(&point), high.sup(&point)));
-        if low.x.is_finite() { Self { low, high } } else { Self { low: Vector2::zeros(), high: Vector2::zeros() } }
+        if low.x.is_finite() {
+            Self { low, high }
+        } else {
+            Self { low: Vector2::zeros(), high: Vector2::zeros() }
+        }
     }
 
     fn size(&self) -> Vector2<f64> {
@@ -152,7 +168,10 @@ fn pieces(robot: &RobotModel, posture: &Posture) -> Result<Vec<Piece>, ModelErro
     kinematics.update_positions(tree, &configuration)?;
     let mut all = Vec::new();
     for shape in shapes(robot) {
-        let body = shape.attachment.body.map_or_else(RigidTransform::identity, |body| kinematics.link_poses_w()[body]);
+        let body = shape
+            .attachment
+            .body
+            .map_or_else(RigidTransform::identity, |body| kinematics.link_poses_w()[body]);
         let pose = body * shape.attachment.pose;
         let colour = shape.rgba.map_or(DEFAULT_COLOUR, |[red, green, blue, _]| [red, green, blue]);
         for quad in surface(&shape.geometry) {
@@ -181,16 +200,24 @@ fn surface(geometry: &Geometry) -> Vec<Quad> {
         Geometry::Box { size } => box_surface(&size),
         Geometry::Cylinder { radius, length } => {
             let z = length / 2.0;
-            let profile = [[0.0, -z], [radius / 2.0, -z], [radius, -z], [radius, 0.0], [radius, z], [radius / 2.0, z], [0.0, z]];
+            let profile = [
+                [0.0, -z],
+                [radius / 2.0, -z],
+                [radius, -z],
+                [radius, 0.0],
+                [radius, z],
+                [radius / 2.0, z],
+                [0.0, z],
+            ];
             lathe(&profile.map(Vector2::from))
         }
         Geometry::Capsule { radius, length } => {
             let lower = quarter(radius, -length / 2.0, -FRAC_PI_2);
             lathe(&lower.chain(quarter(radius, length / 2.0, 0.0)).collect::<Vec<_>>())
         }
-        Geometry::Sphere { radius } => {
-            lathe(&quarter(radius, 0.0, -FRAC_PI_2).chain(quarter(radius, 0.0, 0.0).skip(1)).collect::<Vec<_>>())
-        }
+        Geometry::Sphere { radius } => lathe(
+            &quarter(radius, 0.0, -FRAC_PI_2).chain(quarter(radius, 0.0, 0.0).skip(1)).collect::<Vec<_>>(),
+        ),
     }
 }
 
@@ -236,7 +263,8 @@ fn lathe(profile: &[Vector2<f64>]) -> Vec<Quad> {
 fn shaded(piece: &Piece) -> String {
     let light = Vector3::new(0.55, 0.35, 1.0).normalize();
     let bright = 0.62 + 0.12 * piece.normal.z + 0.42 * piece.normal.dot(&light).max(0.0);
-    let [red, green, blue] = piece.colour.map(|part| (255.0 * part * bright + 14.0).clamp(0.0, 255.0).round() as u8);
+    let [red, green, blue] =
+        piece.colour.map(|part| (255.0 * part * bright + 14.0).clamp(0.0, 255.0).round() as u8);
     format!("#{red:02x}{green:02x}{blue:02x}")
 }
 

@@ -115,7 +115,8 @@ impl LogViewer {
         if let (Some(sole), Some(point)) = (&self.sole, point) {
             let pose = sole.body.map_or(sole.pose, |body| pose_w(links, body) * sole.pose);
             let from = pose.transform_point(&Vector3::new(point.x, point.y, 0.0));
-            let force = pose.rotation * Vector3::from(truth.stance_force_b) * (WEIGHT_ARROW_M / self.weight_n);
+            let force =
+                pose.rotation * Vector3::from(truth.stance_force_b) * (WEIGHT_ARROW_M / self.weight_n);
             arrows.push(arrow(&from, &force, [0.0, 0.45, 0.7]));
         }
         let push = Vector3::from(truth.push_force_w) * PUSH_ARROW_M_PER_N;
@@ -141,7 +142,8 @@ fn robot_scene(setup: &Setup) -> Value {
         let [red, green, blue, alpha] = shape.rgba.unwrap_or([0.5, 0.55, 0.6, 1.0]);
         let colour = json!({"r": red, "g": green, "b": blue, "a": alpha});
         let primitive = |size: Vector3<f64>, more: Value| {
-            let mut value = json!({"pose": pose(&shape.attachment.pose), "size": vector(&size), "color": colour});
+            let mut value =
+                json!({"pose": pose(&shape.attachment.pose), "size": vector(&size), "color": colour});
             if let (Value::Object(value), Value::Object(more)) = (&mut value, more) {
                 value.extend(more);
             }
@@ -154,7 +156,9 @@ fn robot_scene(setup: &Setup) -> Value {
             Geometry::Sphere { radius } => ("spheres", primitive(round(radius, 2.0 * radius), json!({}))),
             Geometry::Cylinder { radius, length } => ("cylinders", primitive(round(radius, length), whole)),
             // Viewers know no capsule: its straight part and half of its caps.
-            Geometry::Capsule { radius, length } => ("cylinders", primitive(round(radius, length + radius), whole)),
+            Geometry::Capsule { radius, length } => {
+                ("cylinders", primitive(round(radius, length + radius), whole))
+            }
         };
         entities.push(entity(&format!("{}-{index}", shape.link), frame, 0, [(kind, vec![value])]));
     }
@@ -220,7 +224,8 @@ fn rounded(x: f64) -> f64 {
     (x * 1e6).round() / 1e6
 }
 
-const PRIMITIVES: [&str; 8] = ["arrows", "cubes", "spheres", "cylinders", "lines", "triangles", "texts", "models"];
+const PRIMITIVES: [&str; 8] =
+    ["arrows", "cubes", "spheres", "cylinders", "lines", "triangles", "texts", "models"];
 
 /// JSON schema of [`TRANSFORMS`].
 pub fn transforms_schema() -> Value {
@@ -237,11 +242,14 @@ pub fn transforms_schema() -> Value {
 /// JSON schema of [`ROBOT`] and [`FORCES`]. Primitives that are never sent are described as arrays of objects.
 pub fn scene_schema() -> Value {
     let number = || json!({"type": "number"});
-    let pose = || object(&[("position", numbers(&["x", "y", "z"])), ("orientation", numbers(&["x", "y", "z", "w"]))]);
+    let pose = || {
+        object(&[("position", numbers(&["x", "y", "z"])), ("orientation", numbers(&["x", "y", "z", "w"]))])
+    };
     let colour = || numbers(&["r", "g", "b", "a"]);
     let solid = || vec![("pose", pose()), ("size", numbers(&["x", "y", "z"])), ("color", colour())];
     let cylinder = [solid(), vec![("bottom_scale", number()), ("top_scale", number())]].concat();
-    let arrow_numbers = ["shaft_length", "shaft_diameter", "head_length", "head_diameter"].map(|name| (name, number()));
+    let arrow_numbers =
+        ["shaft_length", "shaft_diameter", "head_length", "head_diameter"].map(|name| (name, number()));
     let arrow = [vec![("pose", pose()), ("color", colour())], arrow_numbers.to_vec()].concat();
     let other = || array(json!({"type": "object"}));
     let entity = object(&[

@@ -105,7 +105,7 @@ fn run_in_two_processes(
     let time_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as u64);
     let run = RunId::from_seeds(time_ns, std::process::id());
     if options.view {
-        let opened = view.insert(View::new(setup, run, options.port)?);
+        let opened = view.insert(View::new(setup, options.port)?);
         let _ = writeln!(std::io::stderr(), "open {} to begin", opened.address());
     }
     let scenario = folder.file("scenario.toml");
@@ -120,9 +120,11 @@ fn run_in_two_processes(
     };
     let show = talkative && std::io::stderr().is_terminal();
     let mut line = show.then(|| StatusLine::new(setup, run));
-    let course = supervision.supervise(stop, |_| {
-        if let Some(view) = view {
-            view.look();
+    let mut watch = view.as_ref().map(|view| view.watch(setup, run)).transpose()?;
+    // What listens to the run goes into the closure, and ends with it: before the run is tidied up.
+    let course = supervision.supervise(stop, move |_| {
+        if let Some(watch) = &mut watch {
+            watch.look();
         }
         if let Some(text) = line.as_mut().and_then(StatusLine::next) {
             let _ = write!(std::io::stderr(), "\r\x1b[K{text}");

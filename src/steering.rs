@@ -128,9 +128,18 @@ mod tests {
     fn wishes_are_heard_cut_and_refused() {
         let mut wish = Wish::none();
         wish.hear("pull 3 0 0.1 0 0 -30 40", 5);
-        let pull = Pull { time_ns: 0, body: 3, acts: 1, point_b: [0.0, 0.1, 0.0], force_w: [0.0, -30.0, 40.0] };
+        let pull =
+            Pull { time_ns: 0, body: 3, acts: 1, point_b: [0.0, 0.1, 0.0], force_w: [0.0, -30.0, 40.0] };
         assert_eq!(wish, Wish { pull, paused: false });
-        for nonsense in ["", "pull", "pull 5 0 0 0 1 1 1", "pull 3 0 0 0 nan 0 0", "pull 3 99 0 0 1 0 0", "pull 3 0 0", "fly"] {
+        for nonsense in [
+            "",
+            "pull",
+            "pull 5 0 0 0 1 1 1",
+            "pull 3 0 0 0 nan 0 0",
+            "pull 3 99 0 0 1 0 0",
+            "pull 3 0 0",
+            "fly",
+        ] {
             wish.hear(nonsense, 5);
             assert_eq!(wish.pull, pull, "{nonsense}");
         }

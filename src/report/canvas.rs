@@ -3,7 +3,8 @@
 use miniz_oxide::deflate::compress_to_vec_zlib;
 use noto_sans_mono_bitmap::{FontWeight, RasterHeight, get_raster, get_raster_width};
 use tiny_skia::{
-    Color, FillRule, LineCap, LineJoin, Paint, PathBuilder, Pixmap, PremultipliedColorU8, Rect, Stroke, StrokeDash, Transform,
+    Color, FillRule, LineCap, LineJoin, Paint, PathBuilder, Pixmap, PremultipliedColorU8, Rect, Stroke,
+    StrokeDash, Transform,
 };
 
 /// Effort of the compression: beyond it files hardly become smaller.
@@ -60,7 +61,13 @@ impl Canvas {
     }
 
     /// A line through points, broken where a point is no number. `dash`: lengths of line and gap.
-    pub fn line(&mut self, points: impl IntoIterator<Item = [f32; 2]>, with: Colour, width: f32, dash: Option<[f32; 2]>) {
+    pub fn line(
+        &mut self,
+        points: impl IntoIterator<Item = [f32; 2]>,
+        with: Colour,
+        width: f32,
+        dash: Option<[f32; 2]>,
+    ) {
         let mut path = PathBuilder::new();
         let mut open = false;
         for [x, y] in points {
@@ -75,7 +82,8 @@ impl Canvas {
         }
         let Some(path) = path.finish() else { return };
         let dash = dash.and_then(|dash| StrokeDash::new(dash.to_vec(), 0.0));
-        let stroke = Stroke { width, line_cap: LineCap::Round, line_join: LineJoin::Round, dash, ..Stroke::default() };
+        let stroke =
+            Stroke { width, line_cap: LineCap::Round, line_join: LineJoin::Round, dash, ..Stroke::default() };
         self.pixels.stroke_path(&path, &paint(with), &stroke, Transform::identity(), None);
     }
 

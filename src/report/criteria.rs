@@ -40,7 +40,8 @@ pub fn criteria(scenario: &Scenario, summary: &Value) -> Vec<Criterion> {
     }
     if limit.no_touch_down {
         let touched = flag("other_foot_touched");
-        let value = touched.map_or_else(none, |touched| if touched { "touched" } else { "in the air" }.to_owned());
+        let value =
+            touched.map_or_else(none, |touched| if touched { "touched" } else { "in the air" }.to_owned());
         list.push(Criterion {
             name: "Swing foot",
             value,

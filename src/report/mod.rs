@@ -51,7 +51,8 @@ pub fn write(folder: &Path) -> Result<PathBuf, Failure> {
     // A run that broke off early may have no summary; what happened until then can still be looked at.
     let summary = std::fs::read(folder.join("summary.json")).ok();
     let summary = summary.and_then(|bytes| serde_json::from_slice(&bytes).ok()).unwrap_or_default();
-    let cannot = |file: &Path, error: &dyn std::fmt::Display| Failure::Fault(format!("{}: {error}", file.display()));
+    let cannot =
+        |file: &Path, error: &dyn std::fmt::Display| Failure::Fault(format!("{}: {error}", file.display()));
 
     let file = folder.join(REPORT_FILE);
     let page = page::page(&setup, &recording, &summary)?;

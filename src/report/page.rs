@@ -85,7 +85,13 @@ fn events(setup: &Setup) -> Vec<Value> {
     }
     for push in scenario.push.iter().filter(|push| push.impulse_ns > 0.0) {
         let body = robot.link(&push.link).and_then(|link| link.body);
-        event("push", format!("push {} N s", push.impulse_ns), push.start_s, push.start_s + push.duration_s, body);
+        event(
+            "push",
+            format!("push {} N s", push.impulse_ns),
+            push.start_s,
+            push.start_s + push.duration_s,
+            body,
+        );
     }
     events
 }
@@ -105,7 +111,8 @@ fn base64(bytes: &[u8]) -> String {
     const ALPHABET: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
     for chunk in bytes.chunks(3) {
-        let group = chunk.iter().enumerate().fold(0_u32, |group, (i, &byte)| group | u32::from(byte) << (16 - 8 * i));
+        let group =
+            chunk.iter().enumerate().fold(0_u32, |group, (i, &byte)| group | u32::from(byte) << (16 - 8 * i));
         for digit in 0..4 {
             let index = (group >> (18 - 6 * digit)) as usize & 63;
             text.push(if digit <= chunk.len() { ALPHABET[index] as char } else { '=' });
@@ -143,7 +150,14 @@ mod tests {
 
     #[test]
     fn base64_is_that_of_the_rfc() {
-        let cases = [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foob", "Zm9vYg=="), ("foobar", "Zm9vYmFy")];
+        let cases = [
+            ("", ""),
+            ("f", "Zg=="),
+            ("fo", "Zm8="),
+            ("foo", "Zm9v"),
+            ("foob", "Zm9vYg=="),
+            ("foobar", "Zm9vYmFy"),
+        ];
         for (plain, encoded) in cases {
             assert_eq!(base64(plain.as_bytes()), encoded);
         }
@@ -151,7 +165,9 @@ mod tests {
 
     #[test]
     fn no_text_can_leave_its_place_in_the_page() {
-        let page = assemble("<b>&{{data}}", &json!({"scenario": "</script><script>alert(1)</script>{{style}}"})).unwrap();
+        let page =
+            assemble("<b>&{{data}}", &json!({"scenario": "</script><script>alert(1)</script>{{style}}"}))
+                .unwrap();
         assert!(page.contains("<title>&lt;b>&amp;{{data}}"));
         assert!(!page.contains("alert(1)</script>"));
         assert_eq!(page.matches("{{style}}").count(), 1, "kept as text");

@@ -175,7 +175,9 @@ impl Panel {
 fn mass_centre(setup: &Setup, recording: &Recording) -> Result<Canvas, CanvasError> {
     let com = &recording.frames["com"];
     let away = |row: usize, axis: usize| 1e3 * (com.at(row, axis) - com.at(0, axis));
-    let values = (0..com.rows()).flat_map(|row| (0..3).map(move |axis| (row, axis))).map(|(row, axis)| away(row, axis));
+    let values = (0..com.rows())
+        .flat_map(|row| (0..3).map(move |axis| (row, axis)))
+        .map(|(row, axis)| away(row, axis));
     let legend = [("x forward", PALETTE[0]), ("y left", PALETTE[1]), ("z up", PALETTE[2])];
     let title = "Mass centre, mm from its start";
     let mut panel = Panel::new(setup, recording, title, &legend, span(values, [-5.0, 5.0]), Scale::Linear)?;
@@ -185,11 +187,17 @@ fn mass_centre(setup: &Setup, recording: &Recording) -> Result<Canvas, CanvasErr
     Ok(panel.canvas)
 }
 
-fn pressure(setup: &Setup, recording: &Recording, polygon: &[[f64; 2]], axis: usize) -> Result<Canvas, CanvasError> {
+fn pressure(
+    setup: &Setup,
+    recording: &Recording,
+    polygon: &[[f64; 2]],
+    axis: usize,
+) -> Result<Canvas, CanvasError> {
     let corners = polygon.iter().map(|corner| 1e3 * corner[axis]);
     let edges = [corners.clone().fold(f64::INFINITY, f64::min), corners.fold(f64::NEG_INFINITY, f64::max)];
     let room = 0.12 * (edges[1] - edges[0]);
-    let title = ["Pressure point forward, mm in the sole", "Pressure point to the left, mm in the sole"][axis];
+    let title =
+        ["Pressure point forward, mm in the sole", "Pressure point to the left, mm in the sole"][axis];
     let legend = [("pressure point", PALETTE[0]), ("capture point", PALETTE[3]), ("edge of the sole", INK)];
     let y = [edges[0] - room, edges[1] + room];
     let mut panel = Panel::new(setup, recording, title, &legend, y, Scale::Linear)?;
@@ -205,7 +213,9 @@ fn pressure(setup: &Setup, recording: &Recording, polygon: &[[f64; 2]], axis: us
     }
     let (com, velocity) = (&recording.frames["com"], &recording.frames["com_velocity"]);
     let gravity = setup.robot.tree.gravity_w().norm();
-    let capture = |row: usize| 1e3 * (com.at(row, axis) + velocity.at(row, axis) * (com.at(row, 2).max(0.05) / gravity).sqrt());
+    let capture = |row: usize| {
+        1e3 * (com.at(row, axis) + velocity.at(row, axis) * (com.at(row, 2).max(0.05) / gravity).sqrt())
+    };
     panel.rows(&recording.frames, PALETTE[3], DASH, capture);
     let column = |name: &str| &recording.frames[name];
     for name in ["pressure_low", "pressure_high", "pressure"] {
@@ -236,7 +246,10 @@ fn torques(setup: &Setup, recording: &Recording) -> Result<Canvas, CanvasError> 
     let mut joints: Vec<(usize, f64)> = (0..torque.width).map(|joint| (joint, most(joint))).collect();
     joints.sort_by(|a, b| b.1.total_cmp(&a.1));
     joints.truncate(JOINTS);
-    let names = joints.iter().zip(PALETTE).map(|(&(joint, _), colour)| (setup.robot.joint_names[joint].as_str(), colour));
+    let names = joints
+        .iter()
+        .zip(PALETTE)
+        .map(|(&(joint, _), colour)| (setup.robot.joint_names[joint].as_str(), colour));
     let legend: Vec<(&str, Colour)> = names.collect();
     let title = "Torques, % of the limit: the joints that use most of it";
     let highest = joints.first().map_or(0.0, |joint| joint.1).max(100.0) * 1.08;
@@ -265,7 +278,8 @@ fn cycle_time(setup: &Setup, recording: &Recording) -> Result<Canvas, CanvasErro
     let [.., bottom] = panel.frame();
     let time = &cycles["time"];
     let end = panel.x[1];
-    let sum_to = |row: usize, part: usize| parts[..=part].iter().map(|name| cycles[name].at(row, 0)).sum::<f64>();
+    let sum_to =
+        |row: usize, part: usize| parts[..=part].iter().map(|name| cycles[name].at(row, 0)).sum::<f64>();
     for part in (0..parts.len()).rev() {
         let mut points = vec![];
         for row in 0..time.rows() {
@@ -288,9 +302,11 @@ fn constraints(setup: &Setup, recording: &Recording) -> Result<Canvas, CanvasErr
     let cycles = &recording.cycles;
     let of = |column: &Column| (0..column.rows()).map(|row| column.at(row, 0)).fold(4.0, f64::max);
     let highest = list.iter().map(|(_, name)| of(&cycles[name])).fold(0.0, f64::max);
-    let legend: Vec<(&str, Colour)> = list.iter().zip(colours).map(|((label, _), colour)| (*label, colour)).collect();
+    let legend: Vec<(&str, Colour)> =
+        list.iter().zip(colours).map(|((label, _), colour)| (*label, colour)).collect();
     let y = [0.0, 1.08 * highest];
-    let mut panel = Panel::new(setup, recording, "Active constraints, rows per cycle", &legend, y, Scale::Linear)?;
+    let mut panel =
+        Panel::new(setup, recording, "Active constraints, rows per cycle", &legend, y, Scale::Linear)?;
     for ((_, name), colour) in list.into_iter().zip(colours) {
         panel.rows(cycles, colour, None, |row| cycles[name].at(row, 0));
     }
@@ -298,7 +314,11 @@ fn constraints(setup: &Setup, recording: &Recording) -> Result<Canvas, CanvasErr
 }
 
 /// The path of the pressure point in the sole: toes up, as on the page.
-fn sole_from_above(setup: &Setup, recording: &Recording, polygon: &[[f64; 2]]) -> Result<Canvas, CanvasError> {
+fn sole_from_above(
+    setup: &Setup,
+    recording: &Recording,
+    polygon: &[[f64; 2]],
+) -> Result<Canvas, CanvasError> {
     const HEIGHT: f32 = 900.0;
     const ROOM: f32 = 60.0;
     const HEAD: f32 = 60.0;
@@ -333,7 +353,8 @@ fn sole_from_above(setup: &Setup, recording: &Recording, polygon: &[[f64; 2]]) -
 /// Range of values with some room, with the given ones inside.
 fn span(values: impl Iterator<Item = f64>, always: [f64; 2]) -> [f64; 2] {
     let start = (always[0], always[1]);
-    let (low, high) = values.filter(|v| v.is_finite()).fold(start, |(low, high), v| (low.min(v), high.max(v)));
+    let (low, high) =
+        values.filter(|v| v.is_finite()).fold(start, |(low, high), v| (low.min(v), high.max(v)));
     let room = 0.06 * (high - low);
     [low - room, high + room]
 }

@@ -294,8 +294,23 @@ impl FrameBuilder {
 
 /// Names of the columns of a cycle, in the order of [`Cycle`].
 const CYCLE_COLUMNS: [&str; 17] = [
-    "time", "state_in", "shift", "linearize", "riccati", "qp", "publish", "total", "active", "dropped", "solves",
-    "iterations", "violation", "constraint", "verdict", "fallback", "allocations",
+    "time",
+    "state_in",
+    "shift",
+    "linearize",
+    "riccati",
+    "qp",
+    "publish",
+    "total",
+    "active",
+    "dropped",
+    "solves",
+    "iterations",
+    "violation",
+    "constraint",
+    "verdict",
+    "fallback",
+    "allocations",
 ];
 
 /// One control cycle: times in ms, then counts and codes.

@@ -98,15 +98,16 @@ impl Scene {
     pub fn new(robot: &RobotModel) -> Self {
         let tree = &robot.tree;
         let first = tree.first_joint_body();
-        let bodies = tree.bodies().iter().zip(&robot.body_names).enumerate().map(|(index, (body, name))| DrawnBody {
-            name: name.clone(),
-            parent: body.parent,
-            joint: index.checked_sub(first),
-            slides: body.joint.kind == JointKind::Prismatic,
-            placement: pose(&body.joint.placement),
-            axis: body.joint.axis.into(),
-            com: body.inertia.com.into(),
-        });
+        let bodies =
+            tree.bodies().iter().zip(&robot.body_names).enumerate().map(|(index, (body, name))| DrawnBody {
+                name: name.clone(),
+                parent: body.parent,
+                joint: index.checked_sub(first),
+                slides: body.joint.kind == JointKind::Prismatic,
+                placement: pose(&body.joint.placement),
+                axis: body.joint.axis.into(),
+                com: body.inertia.com.into(),
+            });
         let joints = robot.joint_names.iter().zip(&robot.limits).zip(&robot.actuated);
         let soles = robot.soles.iter().filter_map(|sole| {
             let frame = robot.frame(&sole.frame)?;
@@ -135,7 +136,8 @@ impl Scene {
 pub fn shapes(robot: &RobotModel) -> Vec<Shape> {
     let is_visual = |shape: &&Shape| shape.role == ShapeRole::Visual;
     let has_visual = |link: &str| robot.shapes.iter().filter(is_visual).any(|shape| shape.link == link);
-    let drawn = robot.shapes.iter().filter(|shape| shape.role == ShapeRole::Visual || !has_visual(&shape.link));
+    let drawn =
+        robot.shapes.iter().filter(|shape| shape.role == ShapeRole::Visual || !has_visual(&shape.link));
     let drawn: Vec<Shape> = drawn.cloned().collect();
     if drawn.is_empty() { bones(&robot.tree, &robot.body_names) } else { drawn }
 }
@@ -159,8 +161,9 @@ fn bones(tree: &KinematicTree, names: &[String]) -> Vec<Shape> {
         let pose = RigidTransform { rotation: rotation.into_inner(), translation: along / 2.0 };
         shape(body.parent, pose, Geometry::Capsule { radius: BONE_RADIUS_M, length })
     });
-    let at_joints = (0..tree.body_count())
-        .map(|body| shape(Some(body), RigidTransform::identity(), Geometry::Sphere { radius: 1.5 * BONE_RADIUS_M }));
+    let at_joints = (0..tree.body_count()).map(|body| {
+        shape(Some(body), RigidTransform::identity(), Geometry::Sphere { radius: 1.5 * BONE_RADIUS_M })
+    });
     to_children.chain(at_joints).collect()
 }
 

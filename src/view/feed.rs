@@ -83,7 +83,8 @@ impl Feed {
     fn observe(&mut self, state: &PlantState, pull_w: [f64; 3]) {
         let joints = (state.n_joints as usize).min(state.position.len());
         let [x, y, z, w] = state.base_orientation_w;
-        let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)).to_rotation_matrix().into_inner();
+        let rotation =
+            UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)).to_rotation_matrix().into_inner();
         let base = RigidTransform { rotation, translation: state.base_position_w.into() };
         let twist = Twist::new(state.base_angular_velocity_b.into(), state.base_linear_velocity_b.into());
         let motion = Motion {

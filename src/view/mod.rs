@@ -12,7 +12,7 @@
 //! from a page of another origin, are refused.
 
 use std::io::Write;
-use std::sync::PoisonError;
+use std::sync::{Arc, PoisonError};
 
 use delmpc_transport::RunId;
 use serde_json::json;
@@ -29,11 +29,10 @@ use feed::Feed;
 use server::Server;
 
 /// The live page of a run.
+#[derive(Debug)]
 pub struct View {
-    server: Server,
-    feed: Feed,
+    server: Arc<Server>,
     pipe: PlantPipe,
-    begun: bool,
 }
 
 impl View {
@@ -41,13 +40,13 @@ impl View {
     ///
     /// # Errors
     /// [`Failure::Input`] when the port is taken.
-    pub fn new(setup: &Setup, run: RunId, port: u16) -> Result<Self, Failure> {
+    pub fn new(setup: &Setup, port: u16) -> Result<Self, Failure> {
         let mut data = description(setup);
         data["live"] = json!(true);
         let page = assemble(&setup.scenario.name, &data)?;
         let pipe = PlantPipe::default();
-        let server = Server::start(port, page, pipe.clone())?;
-        Ok(Self { server, feed: Feed::new(setup, run)?, pipe, begun: false })
+        let server = Arc::new(Server::start(port, page, pipe.clone())?);
+        Ok(Self { server, pipe })
     }
 
     /// Address of the page.
@@ -60,6 +59,31 @@ impl View {
         self.pipe.clone()
     }
 
+    /// Listens to the run. Drop it before the run's shared memory is tidied up.
+    ///
+    /// # Errors
+    /// [`Failure::Fault`] when shared memory is unusable.
+    pub fn watch(&self, setup: &Setup, run: RunId) -> Result<Watch, Failure> {
+        let feed = Feed::new(setup, run)?;
+        Ok(Watch { server: self.server.clone(), feed, pipe: self.pipe.clone(), begun: false })
+    }
+
+    /// Tells the page how the run ended, and waits a moment until it has heard.
+    pub fn finish(&self, success: bool, failure: Option<&str>) {
+        self.server.publish(json!({"end": {"success": success, "failure": failure}}).to_string());
+        self.server.finish();
+    }
+}
+
+/// Passes on what happens in a run.
+pub struct Watch {
+    server: Arc<Server>,
+    feed: Feed,
+    pipe: PlantPipe,
+    begun: bool,
+}
+
+impl Watch {
     /// Sends what is new. Call it again and again while the run goes on.
     pub fn look(&mut self) {
         if !self.begun && self.server.has_been_opened() {
@@ -68,12 +92,6 @@ impl View {
         if let Some(row) = self.feed.next(self.server.pull_w()) {
             self.server.publish(row);
         }
-    }
-
-    /// Tells the page how the run ended, and waits a moment until it has heard.
-    pub fn finish(self, success: bool, failure: Option<&str>) {
-        self.server.publish(json!({"end": {"success": success, "failure": failure}}).to_string());
-        self.server.finish();
     }
 }
 

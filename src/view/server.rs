@@ -50,7 +50,7 @@ struct Shared {
 #[derive(Debug)]
 pub struct Server {
     shared: Arc<Shared>,
-    acceptor: Option<JoinHandle<()>>,
+    acceptor: Mutex<Option<JoinHandle<()>>>,
 }
 
 impl Server {
@@ -73,7 +73,7 @@ impl Server {
             ends: AtomicBool::new(false),
         });
         let for_acceptor = shared.clone();
-        let acceptor = Some(std::thread::spawn(move || accept_all(&listener, &for_acceptor)));
+        let acceptor = Mutex::new(Some(std::thread::spawn(move || accept_all(&listener, &for_acceptor))));
         Ok(Self { shared, acceptor })
     }
 
@@ -101,13 +101,14 @@ impl Server {
     }
 
     /// Waits until everybody has the last row, but not for long, and ends.
-    pub fn finish(mut self) {
+    pub fn finish(&self) {
         self.shared.ends.store(true, Ordering::Relaxed);
         let begin = Instant::now();
         while self.shared.connections.load(Ordering::Relaxed) > 0 && begin.elapsed() < PATIENCE {
             sleep(LOOK);
         }
-        if let Some(acceptor) = self.acceptor.take() {
+        let acceptor = held(&self.acceptor).take();
+        if let Some(acceptor) = acceptor {
             let _ = acceptor.join();
         }
     }
@@ -200,7 +201,8 @@ fn answer(mut stream: TcpStream, status: &str, kind: &str, body: &str) -> Result
 #[allow(clippy::result_large_err, reason = "the type is that of the websocket crate")]
 fn listen_and_tell(stream: TcpStream, shared: &Shared) -> Result<(), Error> {
     let ours = |request: &Request, response: Response| {
-        let origin = request.headers().get("origin").and_then(|origin| origin.to_str().ok()).unwrap_or_default();
+        let origin =
+            request.headers().get("origin").and_then(|origin| origin.to_str().ok()).unwrap_or_default();
         if origin.strip_prefix("http://").is_some_and(|host| names_us(host, shared.port)) {
             return Ok(response);
         }
@@ -209,7 +211,9 @@ fn listen_and_tell(stream: TcpStream, shared: &Shared) -> Result<(), Error> {
         Err(refusal)
     };
     let config = WebSocketConfig::default().max_message_size(Some(MOST_WISH)).max_frame_size(Some(MOST_WISH));
-    let Ok(mut socket) = tungstenite::accept_hdr_with_config(stream, ours, Some(config)) else { return Ok(()) };
+    let Ok(mut socket) = tungstenite::accept_hdr_with_config(stream, ours, Some(config)) else {
+        return Ok(());
+    };
     shared.opened.store(true, Ordering::Relaxed);
     socket.get_ref().set_read_timeout(Some(LOOK))?;
     let outcome = converse(&mut socket, shared);
@@ -225,20 +229,38 @@ fn converse(socket: &mut WebSocket<TcpStream>, shared: &Shared) -> Result<(), Er
         let news: Vec<Arc<str>> = held(&shared.rows).iter().skip(told).cloned().collect();
         told += news.len();
         for row in &news {
-            socket.write(Message::text(&**row))?;
+            passing(socket.write(Message::text(&**row)))?;
         }
-        socket.flush()?;
+        passing(socket.flush())?;
         if ends {
-            socket.close(None)?;
-            return socket.flush();
+            return say_goodbye(socket);
         }
         match socket.read() {
             Ok(Message::Text(line)) => wish(shared, &line),
             Ok(Message::Close(_)) => return Ok(()),
             Ok(_) => {}
-            Err(Error::Io(error)) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {}
-            Err(error) => return Err(error),
+            Err(error) => passing(Err(error))?,
         }
+    }
+}
+
+/// Closes, and reads until the other end has closed too: what it has not read yet would be lost otherwise.
+fn say_goodbye(socket: &mut WebSocket<TcpStream>) -> Result<(), Error> {
+    passing(socket.close(None))?;
+    let begin = Instant::now();
+    while begin.elapsed() < PATIENCE {
+        passing(socket.flush())?;
+        passing(socket.read().map(drop))?;
+    }
+    Ok(())
+}
+
+/// Time that has run out, and a signal to the process (Ctrl-C), are no failures of a connection.
+fn passing(outcome: Result<(), Error>) -> Result<(), Error> {
+    const PASSING: [ErrorKind; 3] = [ErrorKind::WouldBlock, ErrorKind::TimedOut, ErrorKind::Interrupted];
+    match outcome {
+        Err(Error::Io(error)) if PASSING.contains(&error.kind()) => Ok(()),
+        outcome => outcome,
     }
 }
 

@@ -11,7 +11,7 @@ use tungstenite::stream::MaybeTlsStream;
 use tungstenite::{Message, WebSocket};
 
 /// A page that does not come within this time never will.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_secs(120);
 
 /// A running browser; ended when dropped.
 pub struct Browser {
@@ -23,10 +23,17 @@ pub struct Browser {
 impl Browser {
     /// Starts the browser; where there is none, says that the test is skipped.
     pub fn start(test: &str) -> Option<Self> {
-        let profile = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("chromium-{test}-{}", std::process::id()));
+        let profile =
+            Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("chromium-{test}-{}", std::process::id()));
         let started = ["chromium", "chromium-browser", "google-chrome"].into_iter().find_map(|name| {
             let mut command = Command::new(name);
-            command.args(["--headless=new", "--no-sandbox", "--remote-debugging-port=0", "--no-first-run", "--disable-quic"]);
+            command.args([
+                "--headless=new",
+                "--no-sandbox",
+                "--remote-debugging-port=0",
+                "--no-first-run",
+                "--disable-quic",
+            ]);
             command.args(["--disable-background-networking", "--disable-component-update", "--disable-sync"]);
             // WebGL without a graphics card.
             command.args(["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]);
@@ -96,7 +103,9 @@ impl Page {
             let answer: Value = serde_json::from_str(&text).unwrap();
             let parameters = &answer["params"];
             match answer["method"].as_str() {
-                Some("Runtime.exceptionThrown") => self.problems.push(parameters["exceptionDetails"].to_string()),
+                Some("Runtime.exceptionThrown") => {
+                    self.problems.push(parameters["exceptionDetails"].to_string())
+                }
                 Some("Log.entryAdded") if parameters["entry"]["level"] == "error" => {
                     self.problems.push(parameters["entry"].to_string());
                 }
@@ -136,7 +145,8 @@ impl Page {
     pub fn mouse(&mut self, kind: &str, [x, y]: [f64; 2], pressed: bool) {
         let button = if pressed || kind == "mouseReleased" { "left" } else { "none" };
         let buttons = u32::from(pressed);
-        let event = json!({"type": kind, "x": x, "y": y, "button": button, "buttons": buttons, "clickCount": 1});
+        let event =
+            json!({"type": kind, "x": x, "y": y, "button": button, "buttons": buttons, "clickCount": 1});
         self.send("Input.dispatchMouseEvent", &event);
     }
 

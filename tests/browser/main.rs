@@ -19,7 +19,9 @@ fn reported_run(name: &str) -> PathBuf {
     let folder = Path::new(TEMPORARY).join(format!("browser-{name}"));
     let out = folder.to_str().unwrap();
     let set = |key| ["--set", key];
-    let more = [set("clock=lockstep"), set("duration_s=0.6"), set("reach.start_s=0.1"), set("reach.deadline_s=0.3")].concat();
+    let more =
+        [set("clock=lockstep"), set("duration_s=0.6"), set("reach.start_s=0.1"), set("reach.deadline_s=0.3")]
+            .concat();
     let push = [set("push.start_s=0.3"), set("push.impulse_ns=5"), set("push.duration_s=0.1")].concat();
     let mut command = Command::new(env!("CARGO_BIN_EXE_delmpc"));
     command.args(["run", "--json", "--one-process", "--out", out]).args(more).args(push);
@@ -56,7 +58,7 @@ fn the_report_shows_the_run() {
     assert_ne!(first, later);
 
     // One cursor in all plots; a click into a plot moves the animation.
-    let cursors = "new Set(page.axis.plots.map((plot) => plot.cursor.getAttribute('transform').replace(/[^\\d. ]/g, '').split(' ')[0])).size";
+    let cursors = "new Set(page.axis.plots.map((plot) => plot.cursor.style.transform)).size";
     assert_eq!(page.value(cursors), 1, "all plots have the same width here");
     page.value("page.plots.com.svg.scrollIntoView({block: 'center'})");
     let place = page.value("(() => { const b = page.plots.com.svg.getBoundingClientRect(); return [b.left + page.plots.com.x(0.2), b.top + 60]; })()");
@@ -92,7 +94,10 @@ fn the_report_fits_a_phone_and_both_schemes() {
     assert_eq!(page.value(narrow), true);
     let paper = "getComputedStyle(document.body).backgroundColor";
     let light = page.value(paper);
-    page.send("Emulation.setEmulatedMedia", &json!({"features": [{"name": "prefers-color-scheme", "value": "dark"}]}));
+    page.send(
+        "Emulation.setEmulatedMedia",
+        &json!({"features": [{"name": "prefers-color-scheme", "value": "dark"}]}),
+    );
     page.wait_for(&format!("{paper} !== {light}"));
     page.screenshot(&Path::new(TEMPORARY).join("report-phone.png"));
     assert_no_problems(&mut page);
@@ -110,10 +115,15 @@ impl LiveRun {
     fn start(name: &str, more: &[&str]) -> Self {
         let folder = Path::new(TEMPORARY).join(format!("browser-{name}"));
         let mut command = Command::new(env!("CARGO_BIN_EXE_delmpc"));
-        command.args(["run", "--view", "--json", "--out", folder.to_str().unwrap()]).args(more).current_dir(ROOT);
-        let mut child = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+        command
+            .args(["run", "--view", "--json", "--out", folder.to_str().unwrap()])
+            .args(more)
+            .current_dir(ROOT);
+        let mut child =
+            command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
         let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map_while(Result::ok);
-        let address = lines.find_map(|line| Some(line.strip_prefix("open ")?.strip_suffix(" to begin")?.to_owned()));
+        let address =
+            lines.find_map(|line| Some(line.strip_prefix("open ")?.strip_suffix(" to begin")?.to_owned()));
         std::thread::spawn(move || lines.for_each(drop));
         Self { child, address: address.unwrap(), folder }
     }
@@ -131,15 +141,18 @@ impl Drop for LiveRun {
 #[test]
 fn a_person_pulls_at_the_running_robot_and_pauses() {
     let Some(mut browser) = Browser::start("a_person_pulls_at_the_running_robot_and_pauses") else { return };
-    let mut run = LiveRun::start("live", &["--set", "clock=lockstep", "--set", "duration_s=600", "--set", "push.impulse_ns=0"]);
-    let mut page = browser.open(&run.address, [1400, 900], false);
+    let mut run = LiveRun::start(
+        "live",
+        &["--set", "clock=lockstep", "--set", "duration_s=600", "--set", "push.impulse_ns=0"],
+    );
+    let mut page = browser.open(&run.address, [1000, 640], false);
     page.wait_for("frames.rows > 20");
 
-    // Press on the torso, draw a little to the side, hold.
+    // Press high on the torso, draw a little to the side, hold.
     let torso = "run.robot.bodies.findIndex((body) => body.name === 'utorso')";
     let place = format!(
         "(() => {{ const box = $('view').getBoundingClientRect(), body = {torso}; \
-         const [x, y] = page.view.project(moved(page.motion.poses[body], run.robot.bodies[body].com)); \
+         const [x, y] = page.view.project(moved(page.motion.poses[body], [0, 0, 0.65])); \
          return [x + box.left, y + box.top]; }})()"
     );
     let place = page.value(&place);
@@ -177,7 +190,8 @@ fn a_person_pulls_at_the_running_robot_and_pauses() {
 
     // What the person did is in the log, and a replay does it again, bit by bit.
     let log = std::fs::read(run.folder.join("log.mcap")).unwrap();
-    let messages = mcap::MessageStream::new(&log).unwrap().map(|message| message.unwrap().channel.topic.clone());
+    let messages =
+        mcap::MessageStream::new(&log).unwrap().map(|message| message.unwrap().channel.topic.clone());
     let pulls = messages.filter(|topic| topic == delmpc::log::PULL).count();
     assert!(pulls >= 2, "{pulls} changes of the pull");
     let mut command = Command::new(env!("CARGO_BIN_EXE_delmpc"));

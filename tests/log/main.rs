@@ -44,10 +44,14 @@ fn a_lockstep_run_is_replayed_bit_by_bit() {
 #[test]
 fn the_mcap_package_reads_the_log() {
     let python = |arguments: &[&str]| Command::new("python3").args(arguments).stdin(Stdio::null()).output();
-    let available = python(&["-c", "import mcap.reader, tomllib"]).is_ok_and(|output| output.status.success());
+    let available =
+        python(&["-c", "import mcap.reader, tomllib"]).is_ok_and(|output| output.status.success());
     if !available {
         // Past the capture of the test harness: who runs this should know.
-        let _ = writeln!(std::io::stderr(), "SKIPPED the_mcap_package_reads_the_log: needs python3 and `pip install mcap`");
+        let _ = writeln!(
+            std::io::stderr(),
+            "SKIPPED the_mcap_package_reads_the_log: needs python3 and `pip install mcap`"
+        );
         return;
     }
     let folder = run_of("python", &["--no-report"]);

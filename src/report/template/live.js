@@ -6,7 +6,6 @@ class Live {
     this.following = true;
     this.paused = false;
     this.over = false;
-    this.redrawn = 0;
     run.frame_s ??= 0.025;
     $("kind").textContent = "Live run";
     $("outcome").className = "outcome";
@@ -71,12 +70,12 @@ class Live {
     if (run.duration_s > 20) page.axis.set(from, Math.max(from + 20, frames.end));
     $("time").max = Math.max(frames.end, 0.01);
     if (this.following) page.seek(frames.end);
+    // Redrawing takes at most a tenth of the time.
     const now = performance.now();
-    if (now - this.redrawn > 300) {
-      this.redrawn = now;
-      page.axis.plots.forEach((plot) => plot.draw());
-      page.sole.trail(page.sole.all, Math.max(frames.begin, frames.end - 20), frames.end);
-    }
+    if (now < (this.redrawAt ?? 0)) return;
+    page.axis.plots.forEach((plot) => plot.inSight && plot.draw());
+    page.sole.trail(page.sole.all, Math.max(frames.begin, frames.end - 20), frames.end);
+    this.redrawAt = now + Math.max(300, 10 * (performance.now() - now));
   }
 
   end(outcome) {

@@ -65,7 +65,7 @@ class Page {
       `robot ${run.robot.name}, ${run.robot.mass_kg.toFixed(1)} kg`,
       run.timed ? "real time, two processes" : "lockstep",
       `seed ${run.seed}`,
-      `${(frames.rows ? frames.end - frames.begin : run.duration_s).toFixed(1)} s simulated`,
+      run.live && !frames.rows ? `${run.duration_s} s planned` : `${(frames.end - frames.begin).toFixed(1)} s simulated`,
       figures ? `${figures.cycles ?? cycles.rows} control cycles` : null,
       about.program,
       about.git_revision ? `git ${about.git_revision.slice(0, 12)}` : null,
@@ -164,6 +164,7 @@ class Page {
   }
 
   stop() {
+    if (this.playing) this.axis.plots.forEach((plot) => plot.moveCursor(this.time));
     this.playing = false;
     $("play").textContent = "▶";
     $("play").setAttribute("aria-label", "Play");
@@ -173,13 +174,28 @@ class Page {
     this.time = Math.max(frames.begin, Math.min(frames.end, time));
     $("time").value = this.time;
     $("clock").textContent = `${this.time.toFixed(2)} s`;
-    this.axis.plots.forEach((plot) => plot.moveCursor(this.time));
+    // Numbers that change faster cannot be read, and cost the page more than the picture.
+    const now = performance.now(), withNumbers = !(this.playing || this.live?.following) || now - (this.numbered ?? 0) > 120;
+    if (withNumbers) this.numbered = now;
+    this.axis.plots.forEach((plot) => plot.moveCursor(this.time, withNumbers));
     this.request();
   }
 
   // At most one drawing per picture of the screen.
   request() {
-    this.wanted ??= requestAnimationFrame(() => { this.wanted = undefined; this.show(); });
+    this.wanted ??= requestAnimationFrame(() => { this.wanted = undefined; this.pace(); this.show(); });
+  }
+
+  // Where pictures take too long, smaller ones.
+  pace() {
+    const now = performance.now(), interval = now - (this.shown ?? 0);
+    this.shown = now;
+    if (interval > 500) return;
+    this.interval = 0.9 * (this.interval ?? 16) + 0.1 * interval;
+    if (this.interval > 80 && this.view.quality > 0.5) {
+      this.view.quality *= 0.8;
+      this.interval = 16;
+    }
   }
 
   show() {
