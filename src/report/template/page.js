@@ -142,8 +142,17 @@ class Page {
     };
     button.addEventListener("click", () => { now = order[(order.indexOf(now) + 1) % 3]; apply(); });
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", apply);
-    // On paper everything is light, and the plots have the width of the paper.
-    matchMedia("print").addEventListener("change", () => { this.colours = sceneColours(); this.show(); this.axis.plots.forEach((plot) => plot.draw()); });
+    // On paper everything is light, the plots have the width of the paper, and the robot is a still picture: WebGL is not printed.
+    const print = $("print");
+    addEventListener("beforeprint", () => {
+      document.documentElement.dataset.theme = "light";
+      this.colours = { ...sceneColours(), background: [1, 1, 1] };
+      this.show();
+      Object.assign(print, { width: this.view.canvas.width, height: this.view.canvas.height });
+      print.getContext("2d").drawImage(this.view.canvas, 0, 0);
+    });
+    addEventListener("afterprint", apply);
+    matchMedia("print").addEventListener("change", () => this.axis.plots.forEach((plot) => plot.draw()));
     apply();
   }
 
