@@ -111,7 +111,7 @@ pub enum Command {
 /// Options of `delmpc run`.
 #[derive(Debug, Clone, Default, Args)]
 pub struct RunOptions {
-    /// Folder of the run [default: runs/<scenario>-<time>, to which runs/latest then points]
+    /// Folder of the run [default: runs/SCENARIO-TIME, to which runs/latest then points]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Override a key of the scenario, for example --set plant.friction=0.4; may be given several times

@@ -51,6 +51,7 @@ pub struct LogHead {
     pub viewer: Option<LogViewer>,
 }
 
+#[allow(clippy::large_enum_variant, reason = "the loop must not allocate")]
 enum Record {
     State(PlantState),
     Command(Command),

@@ -204,7 +204,7 @@ impl FrameBuilder {
     /// Takes in the truth at the end of a step; makes it a frame when it is time for one.
     pub fn observe(&mut self, truth: &Truth) {
         self.note(truth);
-        if self.steps % self.stride == 0 {
+        if self.steps.is_multiple_of(self.stride) {
             self.put_frame(truth);
             self.last = None;
         } else {

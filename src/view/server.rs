@@ -306,6 +306,7 @@ mod tests {
     }
 
     #[test]
+    #[allow(clippy::result_large_err, reason = "the type is that of the websocket crate")]
     fn only_the_page_itself_gets_the_stream() {
         let server = Server::start(0, String::new(), PlantPipe::default()).unwrap();
         let port = server.port();
