@@ -30,6 +30,7 @@ Examples:
   delmpc run                                          the main scenario, in real time
   delmpc run configs/scenarios/atlas_one_foot.toml --out /tmp/try
   delmpc run --set push.impulse_ns=20 --set push.direction=[1,0,0]
+  delmpc run --view --set duration_s=60               watch, push with the mouse, pause
   delmpc run --set clock=lockstep --one-process       the same bits every time
   delmpc run runs/latest/scenario.toml                a run of yesterday again";
 
@@ -114,7 +115,7 @@ pub enum Command {
 /// Options of `delmpc run`.
 #[derive(Debug, Clone, Default, Args)]
 pub struct RunOptions {
-    /// Folder of the run [default: runs/<scenario>-<time>, to which runs/latest then points]
+    /// Folder of the run [default: runs/SCENARIO-TIME, to which runs/latest then points]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Override a key of the scenario, for example --set plant.friction=0.4; may be given several times
@@ -126,6 +127,13 @@ pub struct RunOptions {
     /// Print the summary as one JSON object and nothing else
     #[arg(long)]
     pub json: bool,
+    /// Show the run in a browser while it goes on: a page on this machine's loopback, in which one can pull at the robot and pause. The
+    /// run begins when the page is opened
+    #[arg(long, conflicts_with = "one_process")]
+    pub view: bool,
+    /// Port of the page [default: a free one]
+    #[arg(long, value_name = "PORT", requires = "view", default_value_t = 0, hide_default_value = true)]
+    pub port: u16,
     /// Do not write report.html and the plots
     #[arg(long)]
     pub no_report: bool,
@@ -161,4 +169,7 @@ pub struct PartArguments {
     /// A supervisor starts, watches and ends this process
     #[arg(long, hide = true)]
     pub supervised: bool,
+    /// Standard input says what a person does to the plant
+    #[arg(long, hide = true)]
+    pub steered: bool,
 }

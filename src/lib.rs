@@ -20,6 +20,8 @@
 //! | [`completions`] | what a shell needs to complete our words |
 //! | [`log`], [`log_viewer`] | the log of states, commands and truth, and what shows the robot to viewers of logs |
 //! | [`mod@report`] | the run to look at: `report.html` and pictures of the key plots |
+//! | [`steering`] | what a person does to a running plant |
+//! | [`view`] | the live page: watch, pull, pause |
 //! | [`status_line`] | one line about the running run |
 
 pub mod cli;
@@ -45,7 +47,9 @@ pub mod setup;
 pub mod simulated_robot;
 pub mod sole;
 pub mod status_line;
+pub mod steering;
 pub mod summary;
 pub mod supervisor;
 pub mod truth;
 pub mod verdict;
+pub mod view;

@@ -22,6 +22,7 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, Compression, WriteOptions, Writer};
 
 use crate::log_viewer::{self, LogViewer};
+use crate::steering::Pull;
 use crate::truth::Truth;
 use crate::verdict::Failure;
 
@@ -34,6 +35,8 @@ const ENCAPSULATION: [u8; 4] = [0, 1, 0, 0];
 pub const STATE: &str = "/plant/state";
 /// Commands as the plant received them; each holds the report of its cycle.
 pub const COMMAND: &str = "/controller/command";
+/// Pulls of a person: from when on, where, how strong.
+pub const PULL: &str = "/plant/pull";
 /// What really happened.
 pub const TRUTH: &str = "/plant/truth";
 
@@ -48,10 +51,12 @@ pub struct LogHead {
     pub viewer: Option<LogViewer>,
 }
 
+#[allow(clippy::large_enum_variant, reason = "the loop must not allocate")]
 enum Record {
     State(PlantState),
     Command(Command),
     Truth(Truth),
+    Pull(Pull),
 }
 
 /// The loop's end of the log.
@@ -113,6 +118,11 @@ impl Log {
         self.put(truth.time_ns, || Record::Truth(*truth));
     }
 
+    /// Logs a pull that begins, changes or ends.
+    pub fn pull(&mut self, pull: &Pull) {
+        self.put(pull.time_ns, || Record::Pull(*pull));
+    }
+
     fn put(&mut self, time_ns: u64, record: impl FnOnce() -> Record) {
         let Some(queue) = &self.queue else { return };
         let sent = match self.waits {
@@ -145,6 +155,7 @@ struct Channels {
     state: u16,
     command: u16,
     truth: u16,
+    pull: u16,
     viewer: BTreeMap<&'static str, u16>,
 }
 
@@ -171,6 +182,7 @@ impl Channels {
             state: add(STATE, "delmpc_msgs/msg/PlantState", &plant_state_schema())?,
             command: add(COMMAND, "delmpc_msgs/msg/Command", &command_schema())?,
             truth: add(TRUTH, "delmpc_msgs/msg/Truth", TRUTH_FIELDS)?,
+            pull: add(PULL, "delmpc_msgs/msg/Pull", PULL_FIELDS)?,
             viewer,
         })
     }
@@ -196,6 +208,7 @@ fn write_all(
             Record::State(state) => (channels.state, bytes_of(state)),
             Record::Command(command) => (channels.command, bytes_of(command)),
             Record::Truth(truth) => (channels.truth, bytes_of(truth)),
+            Record::Pull(pull) => (channels.pull, bytes_of(pull)),
         };
         bytes.clear();
         bytes.extend_from_slice(&ENCAPSULATION);
@@ -313,6 +326,14 @@ float64 torque_ratio
 float64[3] hand_w
 float64[3] push_force_w
 float64 energy_balance_error
+";
+
+const PULL_FIELDS: &str = "\
+uint64 time_ns
+uint32 body
+uint32 acts
+float64[3] point_b
+float64[3] force_w
 ";
 
 fn plant_state_schema() -> String {
@@ -434,6 +455,7 @@ mod tests {
                 allocations,
             ]
         );
+        assert_layout!(Pull, PULL_FIELDS, [time_ns, body, acts, point_b, force_w]);
         assert_layout!(
             Truth,
             TRUTH_FIELDS,

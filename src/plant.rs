@@ -1,6 +1,7 @@
 //! `delmpc plant`: the plant process.
 
 use std::collections::BTreeMap;
+use std::io::BufReader;
 
 use delmpc_controller_process::membership::Membership;
 use delmpc_messages::{PlantState, Role};
@@ -15,6 +16,7 @@ use crate::plant_process::PlantLoop;
 use crate::run_folder::{PLANT_PART, ROBOT_FILE};
 use crate::setup::Setup;
 use crate::simulated_robot::SimulatedRobot;
+use crate::steering::Steering;
 use crate::verdict::{Ended, Failure};
 
 /// Runs the command.
@@ -46,7 +48,11 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
     let commands = membership.node().subscriber(Channel::Command).map_err(Failure::fault)?;
     let states = membership.node().publisher(Channel::State).map_err(Failure::fault)?;
     let blank = PlantState::new(message_run_id(run, scenario), hash, setup.robot.joint_names.len() as u32);
-    let plant_loop = PlantLoop::new(scenario, states, commands, &blank, log);
+    let steering = match arguments.steered {
+        true => Steering::by_lines(BufReader::new(std::io::stdin()), setup.robot.tree.body_count()),
+        false => Steering::none(),
+    };
+    let plant_loop = PlantLoop::new(scenario, states, commands, &blank, log).steered(steering);
     let (ending, mut part, log) = plant_loop.run(&mut robot, &mut membership).map_err(Failure::fault)?;
     part.log_records_dropped = log.finish()?;
     drop(membership);

@@ -26,6 +26,7 @@ use delmpc_transport::{LinkError, Publisher, Subscriber};
 
 use crate::log::Log;
 use crate::metrics::Metrics;
+use crate::steering::{Pull, Steering};
 use crate::summary::PlantPart;
 use crate::truth::Truth;
 
@@ -47,6 +48,8 @@ pub trait Plant {
     /// # Errors
     /// When the step could not be computed, in words.
     fn step(&mut self) -> Result<(), String>;
+    /// A person pulls at a link from now on, or lets go.
+    fn pull(&mut self, pull: &Pull);
     /// Fills in what the sensors say now; the loop fills in the header.
     fn measure(&mut self, state: &mut PlantState);
     /// Fills in everything that is true now.
@@ -105,6 +108,8 @@ pub struct PlantLoop<'a, P, S> {
     states: P,
     commands: S,
     log: Log,
+    steering: Steering,
+    pull: Pull,
     metrics: Metrics,
     state: Box<PlantState>,
     truth: Box<Truth>,
@@ -139,6 +144,8 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
             states,
             commands,
             log,
+            steering: Steering::none(),
+            pull: Pull::none(),
             metrics: Metrics::new(scenario),
             state: Box::new(*blank),
             truth: Box::new(Truth::new(blank.n_joints)),
@@ -154,6 +161,13 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
             commands_refused: 0,
             watchdog_level_max: 0,
         }
+    }
+
+    /// Somebody pulls and pauses.
+    #[must_use]
+    pub fn steered(mut self, steering: Steering) -> Self {
+        self.steering = steering;
+        self
     }
 
     /// Runs to the end.
@@ -215,6 +229,13 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
         self.start_ns = monotonic_ns();
         self.timing.begin_ns = self.start_ns;
         for _ in 0..self.scenario.steps() {
+            match self.steer(plant, membership)? {
+                Err(order) => return Ok(Ending::Ordered(order)),
+                Ok(stood_ns) => {
+                    self.start_ns += stood_ns;
+                    self.timing.begin_ns += stood_ns;
+                }
+            }
             let due_ns = self.start_ns + self.time_ns + self.step_ns;
             sleep_until(due_ns);
             let late_ns = monotonic_ns().saturating_sub(due_ns);
@@ -246,6 +267,9 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
     ) -> Result<Ending, PlantFault> {
         let steps_per_cycle = u64::from(self.scenario.steps_per_cycle());
         for index in 0..self.scenario.steps() {
+            if let Err(order) = self.steer(plant, membership)? {
+                return Ok(Ending::Ordered(order));
+            }
             if index > 0 && index % steps_per_cycle == 0 {
                 self.send_state(plant, 0)?;
                 if let Some(order) = self.wait_for_the_answer(membership)? {
@@ -257,6 +281,36 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
             }
         }
         Ok(Ending::Finished)
+    }
+
+    /// Hands the plant what a person wishes, and stands still while they wish that; says for how long (ns), or what ended it.
+    fn steer(
+        &mut self,
+        plant: &mut impl Plant,
+        membership: &mut impl Attendance,
+    ) -> Result<Result<u64, Order>, PlantFault> {
+        let mut wish = self.steering.wish();
+        let mut stood_ns = 0;
+        if wish.paused {
+            let begin_ns = monotonic_ns();
+            while wish.paused {
+                let order = membership.attend()?;
+                if order.ends() {
+                    return Ok(Err(order));
+                }
+                self.states.serve_newcomers()?;
+                sleep(PAUSE);
+                wish = self.steering.wish();
+            }
+            stood_ns = monotonic_ns() - begin_ns;
+        }
+        let pull = Pull { time_ns: self.pull.time_ns, ..wish.pull };
+        if pull != self.pull {
+            self.pull = Pull { time_ns: self.time_ns, ..pull };
+            plant.pull(&self.pull);
+            self.log.pull(&self.pull);
+        }
+        Ok(Ok(stood_ns))
     }
 
     fn wait_for_the_answer(&mut self, membership: &mut impl Attendance) -> Result<Option<Order>, PlantFault> {

@@ -11,7 +11,7 @@ use delmpc_messages::{Command, PlantState, status};
 use delmpc_scenario::Clock;
 use mcap::MessageStream;
 
-use crate::log::{COMMAND, STATE, TRUTH, read_record};
+use crate::log::{COMMAND, PULL, STATE, TRUTH, read_record};
 use crate::plant_process::{CommandQueue, Plant};
 use crate::robot_controller::RobotController;
 use crate::setup::Setup;
@@ -118,6 +118,7 @@ fn compare(setup: &Setup, log: &[u8], file: &Path) -> Result<Result<Compared, St
                     }
                 }
             }
+            PULL => plant.pull(&read_record(&message.data).ok_or_else(damaged)?),
             COMMAND => {
                 let logged: Command = read_record(&message.data).ok_or_else(damaged)?;
                 if let Some(answer) = &command {

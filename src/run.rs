@@ -9,7 +9,7 @@ use delmpc_scenario::Clock;
 use delmpc_transport::{RunId, remove_dead_runs};
 use serde::de::DeserializeOwned;
 
-use crate::cli::RunArguments;
+use crate::cli::{RunArguments, RunOptions};
 use crate::one_process::run_in_one_process;
 use crate::run_folder::{CONTROLLER_PART, PLANT_PART, RunFolder};
 use crate::setup::{Setup, scenario_file};
@@ -17,6 +17,7 @@ use crate::status_line::StatusLine;
 use crate::summary::{Summary, table};
 use crate::supervisor::{Course, Supervision};
 use crate::verdict::{Ended, Failure};
+use crate::view::View;
 
 /// Runs the command.
 ///
@@ -42,10 +43,11 @@ pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
     folder.write_inputs(&setup)?;
     let stop = StopFlag::on_signals().map_err(Failure::fault)?;
 
+    let mut view = None;
     let course = if options.one_process {
         run_in_one_process(&setup, &folder, &stop)?
     } else {
-        run_in_two_processes(&setup, &folder, &stop, talkative)?
+        run_in_two_processes(&setup, &folder, &stop, options, &mut view)?
     };
     let (mut plant, mut controller) = (None, None);
     let mut fault = match course {
@@ -64,6 +66,9 @@ pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
     let summary = Summary::new(scenario, plant, controller, fault);
     let written = summary.write(&folder.file("summary.json"));
     written.map_err(|error| Failure::Fault(format!("summary.json: {error}")))?;
+    if let Some(view) = view {
+        view.finish(summary.success, summary.failure.as_deref());
+    }
     if !options.no_report {
         // A run is not worse because it cannot be drawn.
         if let (Err(failure), false) = (crate::report::write(folder.path()), options.quiet) {
@@ -94,23 +99,35 @@ fn run_in_two_processes(
     setup: &Setup,
     folder: &RunFolder,
     stop: &StopFlag,
-    talkative: bool,
+    options: &RunOptions,
+    view: &mut Option<View>,
 ) -> Result<Course, Failure> {
+    let talkative = !options.quiet && !options.json;
     remove_dead_runs();
     let time_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as u64);
     let run = RunId::from_seeds(time_ns, std::process::id());
+    if options.view {
+        let opened = view.insert(View::new(setup, options.port)?);
+        let _ = writeln!(std::io::stderr(), "open {} to begin", opened.address());
+    }
     let scenario = folder.file("scenario.toml");
     let supervision = Supervision {
         run,
         program: std::env::current_exe().map_err(Failure::fault)?,
         arguments: vec![text(&scenario)?, "--out".to_owned(), text(folder.path())?],
         messages: folder.file("messages.txt"),
+        steering: view.as_ref().map(View::pipe),
         show_messages: talkative,
         hang_s: setup.scenario.process.hang_s,
     };
     let show = talkative && std::io::stderr().is_terminal();
     let mut line = show.then(|| StatusLine::new(setup, run));
-    let course = supervision.supervise(stop, |_| {
+    let mut watch = view.as_ref().map(|view| view.watch(setup, run)).transpose()?;
+    // What listens to the run goes into the closure, and ends with it: before the run is tidied up.
+    let course = supervision.supervise(stop, move |_| {
+        if let Some(watch) = &mut watch {
+            watch.look();
+        }
         if let Some(text) = line.as_mut().and_then(StatusLine::next) {
             let _ = write!(std::io::stderr(), "\r\x1b[K{text}");
         }

@@ -17,6 +17,7 @@ use nalgebra::Vector3;
 use crate::observer::{Motion, Observer};
 use crate::plant_process::Plant;
 use crate::setup::Setup;
+use crate::steering::Pull;
 use crate::truth::Truth;
 use crate::verdict::Failure;
 
@@ -31,6 +32,7 @@ pub struct SimulatedRobot {
     plant: simulation::Plant,
     observer: Observer,
     pushes: Vec<simulation::Push>,
+    pull_w: Vector3<f64>,
     clock: ClockKind,
 }
 
@@ -60,7 +62,13 @@ impl SimulatedRobot {
             Clock::Realtime => ClockKind::Monotonic,
             Clock::Lockstep => ClockKind::Simulated,
         };
-        Ok(Self { plant, observer: Observer::new(setup)?, pushes: config.pushes, clock })
+        Ok(Self {
+            plant,
+            observer: Observer::new(setup)?,
+            pushes: config.pushes,
+            pull_w: Vector3::zeros(),
+            clock,
+        })
     }
 }
 
@@ -71,6 +79,12 @@ impl Plant for SimulatedRobot {
 
     fn step(&mut self) -> Result<(), String> {
         self.plant.step().map(|_| ()).map_err(|error| error.to_string())
+    }
+
+    fn pull(&mut self, pull: &Pull) {
+        let acts = pull.acts != 0;
+        self.pull_w = if acts { pull.force_w.into() } else { Vector3::zeros() };
+        self.plant.set_pull(acts.then(|| (pull.body as usize, pull.point_b.into(), self.pull_w)));
     }
 
     fn measure(&mut self, state: &mut PlantState) {
@@ -107,7 +121,7 @@ impl Plant for SimulatedRobot {
         let totals = monitor.totals();
         // Relative to the energy moved; the first joule counts as a joule.
         truth.energy_balance_error = totals.energy_balance_error().abs() / totals.energy_moved.max(1.0);
-        truth.push_force_w = self.push_force_w(truth.time_ns).into();
+        truth.push_force_w = (self.push_force_w(truth.time_ns) + self.pull_w).into();
     }
 }
 

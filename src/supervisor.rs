@@ -14,7 +14,7 @@ use std::fs::File;
 use std::io::{BufRead, BufReader, IsTerminal, Read, Write};
 use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
-use std::process::{Child, Command, ExitStatus, Stdio};
+use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{JoinHandle, sleep};
 use std::time::Duration;
@@ -35,6 +35,9 @@ const START_PATIENCE_S: f64 = 60.0;
 /// A process that was asked to end is killed after this (s).
 const END_PATIENCE_S: f64 = 3.0;
 
+/// The way to a plant that is steered; empty until it is started.
+pub type PlantPipe = Arc<Mutex<Option<ChildStdin>>>;
+
 /// One run's two processes, and how to start them.
 #[derive(Debug)]
 pub struct Supervision {
@@ -48,6 +51,8 @@ pub struct Supervision {
     pub messages: PathBuf,
     /// Whether it is shown too.
     pub show_messages: bool,
+    /// Where the plant's standard input goes when somebody steers it.
+    pub steering: Option<PlantPipe>,
     /// A process that is silent for this long has failed, s.
     pub hang_s: f64,
 }
@@ -146,15 +151,20 @@ impl Supervision {
 
     fn start(&self, node: &RunNode, role: Role, messages: &Arc<Mutex<File>>) -> Result<Watched, Failure> {
         let peer = Peer::new(node, role).map_err(Failure::fault)?;
+        let steering = self.steering.as_ref().filter(|_| role == Role::Plant);
         let mut child = Command::new(&self.program)
             .arg(role.name())
             .args(&self.arguments)
             .args(["--run-id", &self.run.to_string(), "--supervised"])
-            .stdin(Stdio::null())
+            .args(steering.map(|_| "--steered"))
+            .stdin(if steering.is_some() { Stdio::piped() } else { Stdio::null() })
             .stdout(Stdio::null())
             .stderr(Stdio::piped())
             .spawn()
             .map_err(|error| Failure::Fault(format!("cannot start the {} process: {error}", role.name())))?;
+        if let Some(pipe) = steering {
+            *pipe.lock().unwrap_or_else(PoisonError::into_inner) = child.stdin.take();
+        }
         let listener = child.stderr.take().map(|stream| {
             let (messages, show) = (messages.clone(), self.show_messages);
             std::thread::spawn(move || pass_on(role, stream, &messages, show))

@@ -91,7 +91,8 @@ fn the_plan_says_where_the_plant_will_be() {
         // Of a truth the wrench is that of the step that ended then; the predicted one is the mean over the stage.
         let steps = &history[begin + 1..=end];
         let mean = |i: usize| {
-            let of = |truth: &Truth| if i < 3 { truth.stance_torque_b[i] } else { truth.stance_force_b[i - 3] };
+            let of =
+                |truth: &Truth| if i < 3 { truth.stance_torque_b[i] } else { truth.stance_force_b[i - 3] };
             steps.iter().map(of).sum::<f64>() / steps.len() as f64
         };
         let mean: [f64; 6] = std::array::from_fn(mean);
@@ -145,7 +146,9 @@ fn the_summary_is_what_the_log_says() {
     let folder = std::env::temp_dir().join(format!("delmpc-summary-{}", std::process::id()));
     let mut run = Process::new(env!("CARGO_BIN_EXE_delmpc"));
     run.args(["run", "--one-process", "--quiet", "--out"]).arg(&folder);
-    for change in ["clock=lockstep", "duration_s=1.6", "reach.start_s=0.1", "reach.deadline_s=0.6", "reach.hold_s=0.2"] {
+    for change in
+        ["clock=lockstep", "duration_s=1.6", "reach.start_s=0.1", "reach.deadline_s=0.6", "reach.hold_s=0.2"]
+    {
         run.args(["--set", change]);
     }
     run.args(["--set", "push.start_s=1.2"]).current_dir(env!("CARGO_MANIFEST_DIR"));

@@ -99,6 +99,7 @@ pub struct Plant {
     sensors: Sensors,
     monitor: Monitor,
     pushes: Vec<Push>,
+    pull: Option<PointForce>,
     acting: Vec<PointForce>,
     asked: Vec<f64>,
     velocity: Vec<f64>,
@@ -129,7 +130,7 @@ impl Plant {
             contact.friction *= config.errors.friction_scale;
         }
         let options = ContactOptions {
-            max_pushes: config.contact.max_pushes.max(config.pushes.len()),
+            max_pushes: config.contact.max_pushes.max(config.pushes.len() + 1), // and the pull
             ..config.contact
         };
         let contact = ContactStep::new(&tree, dt, &contacts, config.terrain.clone(), options)?;
@@ -142,7 +143,8 @@ impl Plant {
             actuators: Actuators::new(joints, dt, &config.actuators)?,
             sensors: Sensors::new(joints, dt, &config.sensors, config.seed)?,
             monitor: Monitor::new(&tree, &contacts, &model.feet, config.monitor)?,
-            acting: Vec::with_capacity(config.pushes.len()),
+            acting: Vec::with_capacity(config.pushes.len() + 1),
+            pull: None,
             pushes: config.pushes.clone(),
             asked: vec![0.0; joints],
             velocity: vec![0.0; tree.dof()],
@@ -182,6 +184,7 @@ impl Plant {
         self.actuators.apply(&self.asked, &self.velocity[base..]);
         self.acting.clear();
         self.acting.extend(self.pushes.iter().filter_map(|push| push.point_force(&self.tree, time, dt)));
+        self.acting.extend(self.pull);
 
         let torque = self.actuators.torque();
         let solved = self.contact.solve(&self.tree, &self.state, torque, &self.acting);
@@ -206,6 +209,15 @@ impl Plant {
             disturbed: !self.acting.is_empty(),
         };
         Ok(self.last)
+    }
+
+    /// A force in {0} on a point of a body's link frame (m) that acts in every step from now on, until it is set again; `None`: none. A
+    /// body that does not exist is pulled by nothing. No allocation.
+    pub fn set_pull(&mut self, pull: Option<(usize, Vector3<f64>, Vector3<f64>)>) {
+        self.pull = pull.and_then(|(body, point, force_w)| {
+            let point_b = point - self.tree.bodies().get(body)?.inertia.com;
+            Some(PointForce { body, point_b, force_w })
+        });
     }
 
     /// Takes a command of the controller. No allocation.

@@ -14,13 +14,14 @@ use crate::verdict::Failure;
 const PAGE: &str = include_str!("template/page.html");
 const STYLE: &str = include_str!("template/style.css");
 /// In the order in which they need each other.
-const SCRIPTS: [&str; 6] = [
+const SCRIPTS: [&str; 7] = [
     include_str!("template/data.js"),
     include_str!("template/kinematics.js"),
     include_str!("template/mesh.js"),
     include_str!("template/view.js"),
     include_str!("template/plots.js"),
     include_str!("template/page.js"),
+    include_str!("template/live.js"),
 ];
 
 /// The page of a run that is over.

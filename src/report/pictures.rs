@@ -313,7 +313,7 @@ fn constraints(setup: &Setup, recording: &Recording) -> Result<Canvas, CanvasErr
     Ok(panel.canvas)
 }
 
-/// The path of the pressure point in the sole: toes up, as on the page.
+/// The path of the pressure point in the sole, seen from above, toes up.
 fn sole_from_above(
     setup: &Setup,
     recording: &Recording,

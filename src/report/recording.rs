@@ -121,7 +121,8 @@ fn about(log: &[u8]) -> BTreeMap<String, String> {
 }
 
 /// Collects frames from the truth of every step.
-struct FrameBuilder {
+#[derive(Debug, Clone)]
+pub struct FrameBuilder {
     stride: u64,
     frame_s: f64,
     joints: usize,
@@ -158,7 +159,8 @@ impl Extremes {
 }
 
 impl FrameBuilder {
-    fn new(setup: &Setup) -> Self {
+    /// For a robot and a scenario.
+    pub fn new(setup: &Setup) -> Self {
         let scenario = &setup.scenario;
         let stride = (FRAME_S.max(scenario.duration_s / MAX_FRAMES) / scenario.plant.step_s).round().max(1.0);
         let joints = setup.robot.joint_names.len();
@@ -199,7 +201,37 @@ impl FrameBuilder {
         }
     }
 
-    fn observe(&mut self, truth: &Truth) {
+    /// Takes in the truth at the end of a step; makes it a frame when it is time for one.
+    pub fn observe(&mut self, truth: &Truth) {
+        self.note(truth);
+        if self.steps.is_multiple_of(self.stride) {
+            self.put_frame(truth);
+            self.last = None;
+        } else {
+            self.last = Some(Box::new(*truth));
+        }
+        self.steps += 1;
+    }
+
+    /// Makes the truth a frame, whatever the time.
+    pub fn put(&mut self, truth: &Truth) {
+        self.note(truth);
+        self.put_frame(truth);
+    }
+
+    /// The frames so far; later ones begin anew.
+    pub fn take(&mut self) -> Table {
+        let empty = self.table.iter().map(|(name, column)| (*name, Column::new(column.width))).collect();
+        std::mem::replace(&mut self.table, empty)
+    }
+
+    /// All contact points of the feet of which a bit is set.
+    pub fn contacts_of_feet(&self, feet: u32) -> u32 {
+        let touching = self.feet.iter().enumerate().filter(|&(foot, _)| foot < 32 && feet >> foot & 1 != 0);
+        touching.fold(0, |points, (_, mask)| points | mask)
+    }
+
+    fn note(&mut self, truth: &Truth) {
         let since = &mut self.since;
         for (extreme, &torque) in since.torque.iter_mut().zip(&truth.torque) {
             if torque.abs() >= extreme.abs() {
@@ -217,16 +249,9 @@ impl FrameBuilder {
         if length(&truth.push_force_w) > length(&since.push) {
             since.push = truth.push_force_w;
         }
-        if self.steps % self.stride == 0 {
-            self.put(truth);
-            self.last = None;
-        } else {
-            self.last = Some(Box::new(*truth));
-        }
-        self.steps += 1;
     }
 
-    fn put(&mut self, truth: &Truth) {
+    fn put_frame(&mut self, truth: &Truth) {
         let n = self.joints;
         let since = std::mem::replace(&mut self.since, Extremes::none(n));
         let pressure = pressure_point(&truth.stance_torque_b, &truth.stance_force_b);
@@ -261,7 +286,7 @@ impl FrameBuilder {
 
     fn finish(mut self) -> (f64, Table) {
         if let Some(truth) = self.last.take() {
-            self.put(&truth);
+            self.put_frame(&truth);
         }
         (self.frame_s, self.table)
     }
@@ -315,6 +340,11 @@ impl Cycle {
             f64::from(report.allocations),
         ])
     }
+}
+
+/// One cycle as columns.
+pub fn cycle_table_of(command: &Command) -> Table {
+    cycle_table(&[Cycle::new(command)])
 }
 
 /// Cycles as columns; of many cycles, the largest values of each group, at the time of its first one.

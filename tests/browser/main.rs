@@ -2,10 +2,13 @@
 //!
 //! Where there is no Chromium the tests say on standard error that they were skipped. Screenshots are left in the target folder's `tmp`.
 
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
+
 mod chromium;
 
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::{Child, Command, Stdio};
 
 use chromium::{Browser, Page};
 use serde_json::json;
@@ -57,7 +60,7 @@ fn the_report_shows_the_run() {
     assert_ne!(first, later);
 
     // One cursor in all plots; a click into a plot moves the animation.
-    let cursors = "new Set(page.axis.plots.map((plot) => plot.cursor.getAttribute('transform').replace(/[^\\d. ]/g, '').split(' ')[0])).size";
+    let cursors = "new Set(page.axis.plots.map((plot) => plot.cursor.style.transform)).size";
     assert_eq!(page.value(cursors), 1, "all plots have the same width here");
     page.value("page.plots.com.svg.scrollIntoView({block: 'center'})");
     let place = page.value("(() => { const b = page.plots.com.svg.getBoundingClientRect(); return [b.left + page.plots.com.x(0.2), b.top + 60]; })()");
@@ -101,4 +104,100 @@ fn the_report_fits_a_phone_and_both_schemes() {
     page.screenshot(&Path::new(TEMPORARY).join("report-phone.png"));
     assert_no_problems(&mut page);
     std::fs::remove_dir_all(folder).unwrap();
+}
+
+/// A run with a live page, and the page's address.
+struct LiveRun {
+    child: Child,
+    address: String,
+    folder: PathBuf,
+}
+
+impl LiveRun {
+    fn start(name: &str, more: &[&str]) -> Self {
+        let folder = Path::new(TEMPORARY).join(format!("browser-{name}"));
+        let mut command = Command::new(env!("CARGO_BIN_EXE_delmpc"));
+        command
+            .args(["run", "--view", "--json", "--out", folder.to_str().unwrap()])
+            .args(more)
+            .current_dir(ROOT);
+        let mut child =
+            command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map_while(Result::ok);
+        let address =
+            lines.find_map(|line| Some(line.strip_prefix("open ")?.strip_suffix(" to begin")?.to_owned()));
+        std::thread::spawn(move || lines.for_each(drop));
+        Self { child, address: address.unwrap(), folder }
+    }
+}
+
+impl Drop for LiveRun {
+    fn drop(&mut self) {
+        // Asked to end, it ends its processes too.
+        let pid = rustix::process::Pid::from_child(&self.child);
+        let _ = rustix::process::kill_process(pid, rustix::process::Signal::TERM);
+        let _ = self.child.wait();
+    }
+}
+
+#[test]
+fn a_person_pulls_at_the_running_robot_and_pauses() {
+    let Some(mut browser) = Browser::start("a_person_pulls_at_the_running_robot_and_pauses") else { return };
+    let mut run = LiveRun::start(
+        "live",
+        &["--set", "clock=lockstep", "--set", "duration_s=600", "--set", "push.impulse_ns=0"],
+    );
+    let mut page = browser.open(&run.address, [1000, 640], false);
+    page.wait_for("frames.rows > 20");
+
+    // Press high on the torso, draw a little to the side, hold.
+    let torso = "run.robot.bodies.findIndex((body) => body.name === 'utorso')";
+    let place = format!(
+        "(() => {{ const box = $('view').getBoundingClientRect(), body = {torso}; \
+         const [x, y] = page.view.project(moved(page.motion.poses[body], [0, 0, 0.65])); \
+         return [x + box.left, y + box.top]; }})()"
+    );
+    let place = page.value(&place);
+    let [x, y] = [0, 1].map(|i| place[i].as_f64().unwrap());
+    page.mouse("mouseMoved", [x, y], false);
+    page.mouse("mousePressed", [x, y], true);
+    assert_eq!(page.value("page.live.held?.link"), "utorso");
+    for step in 1..=6 {
+        page.mouse("mouseMoved", [x + 3.0 * f64::from(step), y], true);
+        std::thread::sleep(std::time::Duration::from_millis(30));
+    }
+    let push_n = "Math.hypot(...[0, 1, 2].map((i) => frames.at('push', frames.rows - 1, i)))";
+    page.wait_for(&format!("{push_n} > 5"));
+    page.screenshot(&Path::new(TEMPORARY).join("live.png"));
+    page.mouse("mouseReleased", [x + 18.0, y], false);
+    page.wait_for(&format!("{push_n} === 0"));
+
+    // The world stands still until it goes on.
+    page.value("$('play').click()");
+    page.wait_for("$('outcome').textContent.includes('paused')");
+    std::thread::sleep(std::time::Duration::from_millis(300));
+    let stands_at = page.value("frames.end");
+    std::thread::sleep(std::time::Duration::from_millis(300));
+    assert_eq!(page.value("frames.end"), stands_at);
+    page.value("$('play').click()");
+    page.wait_for(&format!("frames.end > {stands_at}"));
+
+    // Somebody ends it: the page is told, and remains to look back.
+    let pid = rustix::process::Pid::from_child(&run.child);
+    rustix::process::kill_process(pid, rustix::process::Signal::INT).unwrap();
+    page.wait_for("page.live.over");
+    assert_ne!(page.value("run.outcome"), serde_json::Value::Null, "the page was not told how it ended");
+    assert_no_problems(&mut page);
+    assert_eq!(run.child.wait().unwrap().code(), Some(130));
+
+    // What the person did is in the log, and a replay does it again, bit by bit.
+    let log = std::fs::read(run.folder.join("log.mcap")).unwrap();
+    let messages =
+        mcap::MessageStream::new(&log).unwrap().map(|message| message.unwrap().channel.topic.clone());
+    let pulls = messages.filter(|topic| topic == delmpc::log::PULL).count();
+    assert!(pulls >= 2, "{pulls} changes of the pull");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_delmpc"));
+    let replay = command.args(["replay", run.folder.to_str().unwrap(), "--verify"]).output().unwrap();
+    assert_eq!(replay.status.code(), Some(0), "{}", String::from_utf8_lossy(&replay.stdout));
+    std::fs::remove_dir_all(&run.folder).unwrap();
 }

@@ -1,5 +1,7 @@
 //! The log of a run in the hands of others: replayed bit by bit by ourselves, read by an independent MCAP reader.
 
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
+
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};

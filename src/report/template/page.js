@@ -65,8 +65,8 @@ class Page {
       `robot ${run.robot.name}, ${run.robot.mass_kg.toFixed(1)} kg`,
       run.timed ? "real time, two processes" : "lockstep",
       `seed ${run.seed}`,
-      `${(frames.end - frames.begin).toFixed(1)} s simulated`,
-      `${cycles.rows ? figures?.cycles ?? cycles.rows : 0} control cycles`,
+      run.live && !frames.rows ? `${run.duration_s} s planned` : `${(frames.end - frames.begin).toFixed(1)} s simulated`,
+      figures ? `${figures.cycles ?? cycles.rows} control cycles` : null,
       about.program,
       about.git_revision ? `git ${about.git_revision.slice(0, 12)}` : null,
     ];
@@ -95,9 +95,6 @@ class Page {
 
   transport() {
     const slider = $("time");
-    const whole = () => { slider.min = frames.begin; slider.max = this.axis.wholeTo ?? Math.max(frames.end, frames.begin + 1e-3); };
-    whole();
-    this.resizeTime = whole;
     slider.addEventListener("input", () => { this.stop(); this.seek(+slider.value); });
     $("play").addEventListener("click", () => (this.playing ? this.stop() : this.play()));
     document.addEventListener("keydown", (event) => {
@@ -106,6 +103,13 @@ class Page {
       if (event.key === " ") { event.preventDefault(); if (this.playing) this.stop(); else this.play(); }
       if (step) { event.preventDefault(); this.stop(); this.seek(this.time + step * (event.shiftKey ? 10 : 1)); }
     });
+    this.timeline();
+  }
+
+  // Slider, marks and ranges of what there is.
+  timeline() {
+    $("time").min = frames.begin;
+    $("time").max = Math.max(frames.end, frames.begin + 1e-3);
     const end = Math.max(frames.end, run.duration_s ?? 0.001);
     $("marks").replaceChildren(...run.events.map(({ kind, label, from, to }) =>
       element("span", { class: kind, title: label, style: `left:${(100 * from) / end}%;width:${Math.max(0.4, (100 * (to - from)) / end)}%` })));
@@ -138,8 +142,17 @@ class Page {
     };
     button.addEventListener("click", () => { now = order[(order.indexOf(now) + 1) % 3]; apply(); });
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", apply);
-    // On paper everything is light, and the plots have the width of the paper.
-    matchMedia("print").addEventListener("change", () => { this.colours = sceneColours(); this.show(); this.axis.plots.forEach((plot) => plot.draw()); });
+    // On paper everything is light, the plots have the width of the paper, and the robot is a still picture: WebGL is not printed.
+    const print = $("print");
+    addEventListener("beforeprint", () => {
+      document.documentElement.dataset.theme = "light";
+      this.colours = { ...sceneColours(), background: [1, 1, 1] };
+      this.show();
+      Object.assign(print, { width: this.view.canvas.width, height: this.view.canvas.height });
+      print.getContext("2d").drawImage(this.view.canvas, 0, 0);
+    });
+    addEventListener("afterprint", apply);
+    matchMedia("print").addEventListener("change", () => this.axis.plots.forEach((plot) => plot.draw()));
     apply();
   }
 
@@ -160,6 +173,7 @@ class Page {
   }
 
   stop() {
+    if (this.playing) this.axis.plots.forEach((plot) => plot.moveCursor(this.time));
     this.playing = false;
     $("play").textContent = "▶";
     $("play").setAttribute("aria-label", "Play");
@@ -169,13 +183,28 @@ class Page {
     this.time = Math.max(frames.begin, Math.min(frames.end, time));
     $("time").value = this.time;
     $("clock").textContent = `${this.time.toFixed(2)} s`;
-    this.axis.plots.forEach((plot) => plot.moveCursor(this.time));
+    // Numbers that change faster cannot be read, and cost the page more than the picture.
+    const now = performance.now(), withNumbers = !(this.playing || this.live?.following) || now - (this.numbered ?? 0) > 120;
+    if (withNumbers) this.numbered = now;
+    this.axis.plots.forEach((plot) => plot.moveCursor(this.time, withNumbers));
     this.request();
   }
 
   // At most one drawing per picture of the screen.
   request() {
-    this.wanted ??= requestAnimationFrame(() => { this.wanted = undefined; this.show(); });
+    this.wanted ??= requestAnimationFrame(() => { this.wanted = undefined; this.pace(); this.show(); });
+  }
+
+  // Where pictures take too long, smaller ones.
+  pace() {
+    const now = performance.now(), interval = now - (this.shown ?? 0);
+    this.shown = now;
+    if (interval > 500) return;
+    this.interval = 0.9 * (this.interval ?? 16) + 0.1 * interval;
+    if (this.interval > 80 && this.view.quality > 0.5) {
+      this.view.quality *= 0.8;
+      this.interval = 16;
+    }
   }
 
   show() {

@@ -27,9 +27,11 @@ class Plot {
       element("span", { class: "key" }, element("i", { class: `mark ${kind ?? "line"} ${mark}` }), name, this.readouts[i]));
     this.note = element("small", {}, note ?? "");
     this.svg = element("svg", { class: "plot", role: "img", "aria-label": title });
+    // Not in the drawing: moving it must not paint the drawing again.
+    this.cursor = element("div", { class: "cursor" });
     this.figure = element("figure", { class: "card chart" },
       element("figcaption", {}, element("span", { class: "name" }, title, unit ? element("em", {}, ` ${unit}`) : ""), this.note),
-      element("div", { class: "keys" }, ...keys), this.svg);
+      element("div", { class: "keys" }, ...keys), element("div", { class: "sheet" }, this.svg, this.cursor));
     parent.append(this.figure);
     axis.plots.push(this);
     const seekTo = (event) => seek?.(this.timeAt(event.clientX - this.svg.getBoundingClientRect().left));
@@ -84,8 +86,7 @@ class Plot {
     const inside = element("g", { "clip-path": `url(#${id})` });
     svg.append(element("defs", {}, clip), grid, labels, inside);
     this.content(inside, svg);
-    this.cursor = element("line", { class: "cursor", y1: TOP, y2: bottom });
-    svg.append(this.cursor);
+    Object.assign(this.cursor.style, { top: `${TOP}px`, height: `${bottom - TOP}px` });
     if (this.now !== undefined) this.moveCursor(this.now);
   }
 
@@ -95,13 +96,19 @@ class Plot {
     return list;
   }
 
-  moveCursor(time) {
+  // Whether any of it is in the window.
+  get inSight() {
+    const { top, bottom } = this.svg.getBoundingClientRect();
+    return bottom > 0 && top < innerHeight;
+  }
+
+  moveCursor(time, withNumbers = true) {
     this.now = time;
-    if (!this.cursor || !this.width) return;
-    const x = this.x(time), inside = time >= this.axis.from && time <= this.axis.to;
-    this.cursor.setAttribute("transform", `translate(${x} 0)`);
-    this.cursor.style.display = inside ? "" : "none";
-    this.legend.forEach(({ read }, i) => { if (read) this.readouts[i].textContent = read(time); });
+    if (!this.width) return;
+    const inside = time >= this.axis.from && time <= this.axis.to;
+    this.cursor.style.transform = `translateX(${this.x(time).toFixed(1)}px)`;
+    this.cursor.style.visibility = inside ? "visible" : "hidden";
+    if (withNumbers) this.legend.forEach(({ read }, i) => { if (read) this.readouts[i].textContent = read(time); });
   }
 
   // A line over the rows of a table; gaps where there is no number. Many rows per pixel become their extremes.

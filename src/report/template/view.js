@@ -39,6 +39,7 @@ class View {
     this.gl = canvas.getContext("webgl2", { alpha: false, antialias: true, stencil: true, preserveDrawingBuffer: true });
     this.camera = { azimuth: 0.95, elevation: 0.16, distance: 3.4, target: [0.12, 0, 0.78] };
     this.meshes = new Map();
+    this.quality = 1;
     if (this.gl) this.prepare(); else this.paper = canvas.getContext("2d");
     this.listen();
   }
@@ -171,7 +172,7 @@ class View {
   }
 
   draw(items, colours) {
-    const ratio = Math.min(2, window.devicePixelRatio || 1);
+    const ratio = Math.min(2, window.devicePixelRatio || 1) * this.quality;
     const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((x) => Math.max(1, Math.round(x * ratio)));
     if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
     if (this.gl) this.render(items, colours); else this.paint(items, colours, ratio);
@@ -306,6 +307,8 @@ function poseAlong(origin, direction) {
   return [x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2], ...origin];
 }
 
+const mixed = (a, b, part) => a.map((x, i) => x + part * (b[i] - x));
+
 // The things that are drawn at a moment.
 class Actors {
   constructor(robot) {
@@ -336,7 +339,7 @@ class Actors {
     const items = this.shapes.map(({ shape, mesh }) => ({
       mesh,
       pose: poseOf(motion.poses, shape),
-      colour: shape.link === motion.grabbed ? colours.push : shape.colour ?? colours.body,
+      colour: shape.link === motion.grabbed ? mixed(shape.colour ?? colours.body, [1, 1, 1], 0.35) : shape.colour ?? colours.body,
       shadow: true,
     }));
     const level = [1, 0, 0, 0, 1, 0, 0, 0, 1];

@@ -1,0 +1,344 @@
+//! A server for one page and its stream, on loopback. A thread per connection, few connections, small requests.
+//!
+//! | request | answer |
+//! |---|---|
+//! | `GET /` | the page |
+//! | `GET /stream`, upgraded to a websocket | all rows so far, then each new one; hears wishes of [`crate::steering`] as text |
+
+use std::io::{ErrorKind, Write};
+use std::net::{Ipv4Addr, Shutdown, TcpListener, TcpStream};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::{JoinHandle, sleep};
+use std::time::{Duration, Instant};
+
+use tungstenite::handshake::server::{ErrorResponse, Request, Response};
+use tungstenite::protocol::WebSocketConfig;
+use tungstenite::{Error, Message, WebSocket};
+
+use crate::steering::Wish;
+use crate::supervisor::PlantPipe;
+use crate::verdict::Failure;
+use crate::view::send_line;
+
+/// Most connections at a time.
+const MOST_CONNECTIONS: usize = 16;
+/// Most bytes of a request's head, and of a wish.
+const MOST_HEAD: usize = 8192;
+const MOST_WISH: usize = 256;
+/// Rows kept for who comes later: 40 a second, so 25 minutes.
+const MOST_ROWS: usize = 60_000;
+/// Time between two looks for new rows while a connection is silent.
+const LOOK: Duration = Duration::from_millis(15);
+/// A reader that is slower than this is gone.
+const PATIENCE: Duration = Duration::from_secs(3);
+
+/// What the connections share.
+#[derive(Debug)]
+struct Shared {
+    page: String,
+    port: u16,
+    rows: Mutex<Vec<Arc<str>>>,
+    wish: Mutex<Wish>,
+    pipe: PlantPipe,
+    connections: AtomicUsize,
+    opened: AtomicBool,
+    ends: AtomicBool,
+}
+
+/// The server.
+#[derive(Debug)]
+pub struct Server {
+    shared: Arc<Shared>,
+    acceptor: Mutex<Option<JoinHandle<()>>>,
+}
+
+impl Server {
+    /// Begins to serve; port 0: a free one.
+    ///
+    /// # Errors
+    /// [`Failure::Input`] when the port is taken.
+    pub fn start(port: u16, page: String, pipe: PlantPipe) -> Result<Self, Failure> {
+        let cannot = |error: &dyn std::fmt::Display| Failure::Input(format!("--port {port}: {error}"));
+        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port)).map_err(|error| cannot(&error))?;
+        listener.set_nonblocking(true).map_err(|error| cannot(&error))?;
+        let shared = Arc::new(Shared {
+            page,
+            port: listener.local_addr().map_err(|error| cannot(&error))?.port(),
+            rows: Mutex::default(),
+            wish: Mutex::new(Wish::none()),
+            pipe,
+            connections: AtomicUsize::new(0),
+            opened: AtomicBool::new(false),
+            ends: AtomicBool::new(false),
+        });
+        let for_acceptor = shared.clone();
+        let acceptor = Mutex::new(Some(std::thread::spawn(move || accept_all(&listener, &for_acceptor))));
+        Ok(Self { shared, acceptor })
+    }
+
+    /// The port.
+    pub fn port(&self) -> u16 {
+        self.shared.port
+    }
+
+    /// Whether anybody has ever listened.
+    pub fn has_been_opened(&self) -> bool {
+        self.shared.opened.load(Ordering::Relaxed)
+    }
+
+    /// Sends a row to all who listen.
+    pub fn publish(&self, row: String) {
+        let mut rows = held(&self.shared.rows);
+        if rows.len() < MOST_ROWS {
+            rows.push(row.into());
+        }
+    }
+
+    /// With what force a person pulls now (N).
+    pub fn pull_w(&self) -> [f64; 3] {
+        held(&self.shared.wish).pull.force_w
+    }
+
+    /// Waits until everybody has the last row, but not for long, and ends.
+    pub fn finish(&self) {
+        self.shared.ends.store(true, Ordering::Relaxed);
+        let begin = Instant::now();
+        while self.shared.connections.load(Ordering::Relaxed) > 0 && begin.elapsed() < PATIENCE {
+            sleep(LOOK);
+        }
+        let acceptor = held(&self.acceptor).take();
+        if let Some(acceptor) = acceptor {
+            let _ = acceptor.join();
+        }
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.shared.ends.store(true, Ordering::Relaxed);
+    }
+}
+
+fn held<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn accept_all(listener: &TcpListener, shared: &Arc<Shared>) {
+    while !shared.ends.load(Ordering::Relaxed) {
+        let Ok((stream, _)) = listener.accept() else {
+            sleep(LOOK);
+            continue;
+        };
+        if shared.connections.fetch_add(1, Ordering::Relaxed) >= MOST_CONNECTIONS {
+            shared.connections.fetch_sub(1, Ordering::Relaxed);
+            continue; // dropped: closed
+        }
+        let shared = shared.clone();
+        std::thread::spawn(move || {
+            // A connection that breaks is the reader's affair.
+            let _ = serve(stream, &shared);
+            shared.connections.fetch_sub(1, Ordering::Relaxed);
+        });
+    }
+}
+
+fn serve(stream: TcpStream, shared: &Shared) -> Result<(), Error> {
+    stream.set_nonblocking(false)?;
+    stream.set_nodelay(true)?;
+    stream.set_read_timeout(Some(PATIENCE))?;
+    stream.set_write_timeout(Some(PATIENCE))?;
+    let head = peek_head(&stream)?;
+    if !names_us(header(&head, "host"), shared.port) {
+        return answer(stream, "403 Forbidden", "text/plain", "this page is for this machine only\n");
+    }
+    let path = head.split(' ').nth(1).unwrap_or_default();
+    match (head.starts_with("GET "), path) {
+        (true, "/") => answer(stream, "200 OK", "text/html; charset=utf-8", &shared.page),
+        (true, "/stream") => listen_and_tell(stream, shared),
+        _ => answer(stream, "404 Not Found", "text/plain", "nothing here\n"),
+    }
+}
+
+/// The head of a request, left in the stream.
+fn peek_head(stream: &TcpStream) -> Result<String, Error> {
+    let mut bytes = vec![0; MOST_HEAD];
+    let begin = Instant::now();
+    loop {
+        let length = stream.peek(&mut bytes)?;
+        let head = String::from_utf8_lossy(&bytes[..length]);
+        if head.contains("\r\n\r\n") || length == 0 || length == MOST_HEAD || begin.elapsed() > PATIENCE {
+            return Ok(head.into_owned());
+        }
+        sleep(Duration::from_millis(1));
+    }
+}
+
+fn header<'a>(head: &'a str, name: &str) -> &'a str {
+    let mut lines = head.lines().skip(1).filter_map(|line| line.split_once(':'));
+    lines.find(|(key, _)| key.eq_ignore_ascii_case(name)).map_or("", |(_, value)| value.trim())
+}
+
+/// Whether a host is this server by one of its own names, so that no foreign name that leads here is taken for it.
+fn names_us(host: &str, port: u16) -> bool {
+    ["127.0.0.1", "localhost"].iter().any(|name| host == format!("{name}:{port}"))
+}
+
+fn answer(mut stream: TcpStream, status: &str, kind: &str, body: &str) -> Result<(), Error> {
+    // The request is read before the connection closes: closing over unread bytes would reset it.
+    let mut request = vec![0; MOST_HEAD];
+    let _ = std::io::Read::read(&mut stream, &mut request)?;
+    let length = body.len();
+    write!(
+        stream,
+        "HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {length}\r\nCache-Control: no-store\r\n\
+         X-Content-Type-Options: nosniff\r\nX-Frame-Options: DENY\r\nConnection: close\r\n\r\n{body}"
+    )?;
+    stream.shutdown(Shutdown::Write)?;
+    Ok(())
+}
+
+#[allow(clippy::result_large_err, reason = "the type is that of the websocket crate")]
+fn listen_and_tell(stream: TcpStream, shared: &Shared) -> Result<(), Error> {
+    let ours = |request: &Request, response: Response| {
+        let origin =
+            request.headers().get("origin").and_then(|origin| origin.to_str().ok()).unwrap_or_default();
+        if origin.strip_prefix("http://").is_some_and(|host| names_us(host, shared.port)) {
+            return Ok(response);
+        }
+        let mut refusal = ErrorResponse::new(Some("only the page itself may steer".to_owned()));
+        *refusal.status_mut() = tungstenite::http::StatusCode::FORBIDDEN;
+        Err(refusal)
+    };
+    let config = WebSocketConfig::default().max_message_size(Some(MOST_WISH)).max_frame_size(Some(MOST_WISH));
+    let Ok(mut socket) = tungstenite::accept_hdr_with_config(stream, ours, Some(config)) else {
+        return Ok(());
+    };
+    shared.opened.store(true, Ordering::Relaxed);
+    socket.get_ref().set_read_timeout(Some(LOOK))?;
+    let outcome = converse(&mut socket, shared);
+    // A page that is closed pulls at nothing any more.
+    wish(shared, "release");
+    outcome
+}
+
+fn converse(socket: &mut WebSocket<TcpStream>, shared: &Shared) -> Result<(), Error> {
+    let mut told = 0;
+    loop {
+        let ends = shared.ends.load(Ordering::Relaxed);
+        let news: Vec<Arc<str>> = held(&shared.rows).iter().skip(told).cloned().collect();
+        told += news.len();
+        for row in &news {
+            passing(socket.write(Message::text(&**row)))?;
+        }
+        passing(socket.flush())?;
+        if ends {
+            return say_goodbye(socket);
+        }
+        match socket.read() {
+            Ok(Message::Text(line)) => wish(shared, &line),
+            Ok(Message::Close(_)) => return Ok(()),
+            Ok(_) => {}
+            Err(error) => passing(Err(error))?,
+        }
+    }
+}
+
+/// Closes, and reads until the other end has closed too: what it has not read yet would be lost otherwise.
+fn say_goodbye(socket: &mut WebSocket<TcpStream>) -> Result<(), Error> {
+    passing(socket.close(None))?;
+    let begin = Instant::now();
+    while begin.elapsed() < PATIENCE {
+        passing(socket.flush())?;
+        passing(socket.read().map(drop))?;
+    }
+    Ok(())
+}
+
+/// Time that has run out, and a signal to the process (Ctrl-C), are no failures of a connection.
+fn passing(outcome: Result<(), Error>) -> Result<(), Error> {
+    const PASSING: [ErrorKind; 3] = [ErrorKind::WouldBlock, ErrorKind::TimedOut, ErrorKind::Interrupted];
+    match outcome {
+        Err(Error::Io(error)) if PASSING.contains(&error.kind()) => Ok(()),
+        outcome => outcome,
+    }
+}
+
+/// Passes a wish on if it is one.
+fn wish(shared: &Shared, line: &str) {
+    let line = line.lines().next().unwrap_or_default();
+    let mut wish = held(&shared.wish);
+    let before = *wish;
+    // How many bodies there are, the plant knows.
+    wish.hear(line, usize::MAX);
+    if *wish != before {
+        send_line(&shared.pipe, line);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::Read;
+
+    fn ask(port: u16, request: &str) -> String {
+        let mut stream = TcpStream::connect((Ipv4Addr::LOCALHOST, port)).unwrap();
+        stream.write_all(request.as_bytes()).unwrap();
+        let mut text = String::new();
+        stream.read_to_string(&mut text).unwrap();
+        text
+    }
+
+    #[test]
+    fn the_page_is_served_to_this_machine_and_to_its_own_names() {
+        let server = Server::start(0, "<p>page".to_owned(), PlantPipe::default()).unwrap();
+        let port = server.port();
+        let get = |path: &str, host: &str| ask(port, &format!("GET {path} HTTP/1.1\r\nHost: {host}\r\n\r\n"));
+        let us = format!("127.0.0.1:{port}");
+        assert!(get("/", &us).ends_with("\r\n\r\n<p>page"));
+        assert!(get("/", &format!("localhost:{port}")).starts_with("HTTP/1.1 200 "));
+        assert!(get("/secret", &us).starts_with("HTTP/1.1 404 "));
+        assert!(get("/", "evil.example").starts_with("HTTP/1.1 403 "));
+        assert!(get("/", &format!("127.0.0.1.evil.example:{port}")).starts_with("HTTP/1.1 403 "));
+        assert!(ask(port, "POST / HTTP/1.1\r\n\r\n").starts_with("HTTP/1.1 403 "));
+        assert!(!server.has_been_opened());
+        server.finish();
+    }
+
+    #[test]
+    #[allow(clippy::result_large_err, reason = "the type is that of the websocket crate")]
+    fn only_the_page_itself_gets_the_stream() {
+        let server = Server::start(0, String::new(), PlantPipe::default()).unwrap();
+        let port = server.port();
+        let connect = |origin: &str| {
+            let stream = TcpStream::connect((Ipv4Addr::LOCALHOST, port)).unwrap();
+            let request = Request::builder()
+                .uri(format!("ws://127.0.0.1:{port}/stream"))
+                .header("host", format!("127.0.0.1:{port}"))
+                .header("origin", origin)
+                .header("connection", "Upgrade")
+                .header("upgrade", "websocket")
+                .header("sec-websocket-version", "13")
+                .header("sec-websocket-key", "dGhlIHNhbXBsZSBub25jZQ==");
+            tungstenite::client(request.body(()).unwrap(), stream)
+        };
+        assert!(connect("http://evil.example").is_err());
+        assert!(!server.has_been_opened());
+
+        server.publish("1".to_owned());
+        let (mut socket, _) = connect(&format!("http://127.0.0.1:{port}")).unwrap();
+        assert_eq!(socket.read().unwrap(), Message::text("1"));
+        assert!(server.has_been_opened());
+        socket.send(Message::text("pull 2 0 0 0 10 0 0")).unwrap();
+        let begin = Instant::now();
+        while server.pull_w() != [10.0, 0.0, 0.0] {
+            assert!(begin.elapsed() < PATIENCE);
+            sleep(LOOK);
+        }
+        drop(socket);
+        while server.pull_w() != [0.0; 3] {
+            assert!(begin.elapsed() < 2 * PATIENCE, "a page that is gone pulls on");
+            sleep(LOOK);
+        }
+    }
+}
