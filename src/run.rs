@@ -128,7 +128,7 @@ fn run_in_two_processes(
         if let Some(watch) = &mut watch {
             watch.look();
         }
-        if let Some(text) = line.as_mut().and_then(StatusLine::next) {
+        if let Some(text) = line.as_mut().and_then(StatusLine::look) {
             let _ = write!(std::io::stderr(), "\r\x1b[K{text}");
         }
     });

@@ -51,7 +51,7 @@ impl StatusLine {
     }
 
     /// The next line, when it is time for one.
-    pub fn next(&mut self) -> Option<String> {
+    pub fn look(&mut self) -> Option<String> {
         let now = monotonic_ns();
         if now < self.next_ns {
             return None;

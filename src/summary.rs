@@ -183,11 +183,11 @@ fn missed_criterion(scenario: &Scenario, plant: &PlantPart) -> Option<String> {
     }
     let realtime = scenario.clock == Clock::Realtime;
     let at_most = |key: &str, value: Option<f64>, most: f64| {
-        let value = value.filter(|value| !(*value <= most))?;
+        let value = value.filter(|value| value.is_nan() || *value > most)?;
         Some(format!("{key} = {value:.4}, allowed is at most {most}"))
     };
     let at_least = |key: &str, value: Option<f64>, least: f64| {
-        let value = value.filter(|value| !(*value >= least))?;
+        let value = value.filter(|value| value.is_nan() || *value < least)?;
         Some(format!("{key} = {value:.4}, needed is at least {least}"))
     };
     at_most("hand_error_at_deadline_m", robot.hand_error_at_deadline_m, limit.hand_error_at_deadline_m)

@@ -132,10 +132,10 @@ impl Supervision {
                 Err(failure) => break Err(failure),
             }
             let ready = |process: &Watched| process.peer.state() == Some(ProcessState::Ready);
-            if processes.iter().all(ready) {
-                if let Err(error) = presence.announce(ProcessState::Running) {
-                    break Err(Failure::fault(error));
-                }
+            if processes.iter().all(ready)
+                && let Err(error) = presence.announce(ProcessState::Running)
+            {
+                break Err(Failure::fault(error));
             }
             look(ids);
             sleep(LOOK);

@@ -1,4 +1,5 @@
 //! The command as a person calls it: exit status, messages, and the numbers of `delmpc model`.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};

@@ -1,6 +1,7 @@
 //! The real command with its two real processes: what happens when one is killed, stopped, late, or told to end.
 //!
 //! Nothing here asserts how long something takes; a watchdog ends what hangs.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod support;
 

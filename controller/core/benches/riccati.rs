@@ -4,7 +4,6 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 #[path = "../tests/random_problem/mod.rs"]
-#[allow(dead_code)]
 mod random_problem;
 
 use std::hint::black_box;

@@ -69,6 +69,8 @@ pub struct ConeRow {
 #[derive(Clone, Debug)]
 pub struct WrenchCone {
     rows: Vec<ConeRow>,
+    /// The coefficients of all rows, one row a column.
+    coefficients: Mat<f64>,
 }
 
 impl WrenchCone {
@@ -142,7 +144,8 @@ impl WrenchCone {
                 tag: moment(ConstraintKind::YawTorque, i),
             });
         }
-        Ok(Self { rows })
+        let coefficients = Mat::from_fn(6, rows.len(), |i, row| rows[row].coefficients[i]);
+        Ok(Self { rows, coefficients })
     }
 
     /// The rows.
@@ -219,14 +222,15 @@ impl StageWrench {
     /// Writes the cone's rows into the stage, from row `first` on, with soft penalties. Rows that do not fit are left out.
     pub fn write_rows(&self, cone: &WrenchCone, stage: &mut LqStage) {
         stage.row_count = cone.rows.len().min(stage.row_bound.len());
-        for (i, row) in cone.rows.iter().enumerate().take(stage.row_count) {
-            gemm(
-                stage.rows.as_mut().subcols_mut(i, 1),
-                Accum::Replace,
-                self.map.as_ref().transpose(),
-                faer::MatRef::from_column_major_slice(&row.coefficients, 6, 1),
-                1.0,
-            );
+        let count = stage.row_count;
+        gemm(
+            stage.rows.as_mut().subcols_mut(0, count),
+            Accum::Replace,
+            self.map.as_ref().transpose(),
+            cone.coefficients.as_ref().subcols(0, count),
+            1.0,
+        );
+        for (i, row) in cone.rows.iter().enumerate().take(count) {
             let value: f64 = row.coefficients.iter().zip(&self.value).map(|(c, w)| c * w).sum();
             stage.row_bound[i] = row.bound - value;
             stage.row_tag[i] = row.tag;

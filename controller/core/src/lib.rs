@@ -14,6 +14,7 @@
 //! Reading order: [`model`], [`config`], [`cycle`]; then in the order of the cycle [`estimator`], [`plan`], [`stage_dynamics`],
 //! [`node_kinematics`], [`tasks`], [`reference`], [`contact_wrench`], [`lq_problem`], [`riccati`], [`dare`], [`projected_qp`],
 //! [`dual_qp`], [`fallback`].
+#![allow(clippy::needless_range_loop)]
 #![cfg_attr(not(feature = "std"), no_std)]
 #![forbid(unsafe_code)]
 

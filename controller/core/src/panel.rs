@@ -17,7 +17,7 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
-use faer::MatRef;
+use faer::{Mat, MatRef};
 use pulp::Simd;
 
 /// Doubles in a block: the widest register.
@@ -95,6 +95,47 @@ impl Panel {
     }
 }
 
+/// Square root in the instruction set of the caller: one outside it would stall the vector unit.
+#[inline(always)]
+pub(crate) fn sqrt(x: f64) -> f64 {
+    #[cfg(feature = "std")]
+    return x.sqrt();
+    #[cfg(not(feature = "std"))]
+    return libm::sqrt(x);
+}
+
+/// `target(j, i) = source(i, j)` for `count` columns of the source from `first` on, into the rows of the target from `row` on. Eight
+/// columns at a time: eight streams in, one out.
+pub(crate) fn transpose(source: &Mat<f64>, first: usize, count: usize, target: &mut Panel, row: usize) {
+    let stride = target.stride;
+    let entries = target.entries_mut();
+    for block in (0..count).step_by(BLOCK) {
+        let width = BLOCK.min(count - block);
+        // Beyond the last column it comes again, and is not written.
+        let columns: [&[f64]; BLOCK] =
+            core::array::from_fn(|i| source.col_as_slice(first + block + i.min(width - 1)));
+        for (l, line) in entries.chunks_exact_mut(stride).take(source.nrows()).enumerate() {
+            let line = &mut line[row + block..][..width];
+            for (entry, column) in line.iter_mut().zip(&columns) {
+                *entry = column[l];
+            }
+        }
+    }
+}
+
+/// Copies the lower triangle of a column-major square matrix onto the upper one, eight by eight.
+pub(crate) fn mirror(matrix: &mut [f64], stride: usize, size: usize) {
+    for first_column in (0..size).step_by(BLOCK) {
+        for first_row in (0..=first_column).step_by(BLOCK) {
+            for column in first_column..size.min(first_column + BLOCK) {
+                for row in first_row..column.min(first_row + BLOCK) {
+                    matrix[column * stride + row] = matrix[row * stride + column];
+                }
+            }
+        }
+    }
+}
+
 /// Sums in registers: six columns of `R` registers.
 pub(crate) type Tile<S, const R: usize> = [[<S as Simd>::f64s; R]; TILE];
 
@@ -165,5 +206,28 @@ mod tests {
         }
         assert_eq!(a.stride(), 16);
         assert_eq!(a.view(13)[(12, 4)], a.column(4)[12]);
+    }
+
+    #[test]
+    fn transposing_and_mirroring_keep_to_their_place() {
+        let source = Mat::from_fn(11, 13, |i, j| (100 * i + j) as f64);
+        let mut panel = Panel::zeros(16, 11);
+        transpose(&source, 2, 10, &mut panel, 3);
+        for row in 0..16 {
+            for column in 0..11 {
+                let inside = (3..13).contains(&row);
+                let expected = if inside { source[(column, 2 + row - 3)] } else { 0.0 };
+                assert_eq!(panel.column(column)[row], expected, "{row} {column}");
+            }
+        }
+        let mut square: Vec<f64> = (0..16 * 11).map(f64::from).collect();
+        let before = square.clone();
+        mirror(&mut square, 16, 11);
+        for column in 0..11 {
+            for row in 0..16 {
+                let from = if row < column { row * 16 + column } else { column * 16 + row };
+                assert_eq!(square[column * 16 + row], before[from]);
+            }
+        }
     }
 }

@@ -33,7 +33,7 @@ use pulp::{Arch, Simd, WithSimd};
 use crate::errors::ControlError;
 use crate::kernels::{gemm, gemv, vector_mut};
 use crate::lq_problem::{LqProblem, LqSize, LqStage};
-use crate::panel::{BLOCK, Panel, TILE, Tile, accumulate, padded, zero_tile};
+use crate::panel::{BLOCK, Panel, TILE, Tile, accumulate, mirror, padded, sqrt, transpose, zero_tile};
 
 /// What one stage of the recursion leaves behind.
 #[derive(Clone, Debug)]
@@ -239,14 +239,10 @@ impl Scratch {
     /// Brings a stage into panels.
     fn take(&mut self, stage: &LqStage, inputs: usize, states: usize) {
         let first_x = padded(inputs);
+        transpose(&stage.transition, 0, inputs, &mut self.transition, 0);
+        transpose(&stage.transition, inputs, states, &mut self.transition, first_x);
         let stride = self.transition.stride();
         let entries = self.transition.entries_mut();
-        for z in 0..inputs + states {
-            let row = if z < inputs { z } else { first_x + z - inputs };
-            for (l, value) in stage.transition.col_as_slice(z).iter().enumerate() {
-                entries[l * stride + row] = *value;
-            }
-        }
         let one = first_x + states;
         for (l, value) in stage.defect.iter().enumerate() {
             entries[l * stride + one] = *value;
@@ -379,21 +375,21 @@ impl EliminateInputs<'_> {
                     subtract_columns::<S, 1>(simd, panel, j, row);
                 }
             }
-            let column = panel.column_mut(j);
-            let pivot = column[j];
+            let pivot = panel.column(j)[j];
             if !(pivot > 0.0 && pivot.is_finite()) {
                 return false;
             }
-            let inverse = 1.0 / libm::sqrt(pivot);
-            column[..j].fill(0.0);
-            for entry in &mut column[j..] {
-                *entry *= inverse;
+            let inverse = simd.splat_f64s(1.0 / sqrt(pivot));
+            for entry in &mut panel.registers_mut::<S>()[j * registers + first..(j + 1) * registers] {
+                *entry = simd.mul_f64s(*entry, inverse);
             }
         }
-        let rows = self.factors.input_factor.stride();
+        // Above the diagonal the panel holds what the tiles left there.
         for j in 0..self.inputs {
-            let from = &panel.column(j)[..rows];
-            self.factors.input_factor.column_mut(j).copy_from_slice(from);
+            let column = self.factors.input_factor.column_mut(j);
+            for (row, (entry, from)) in column.iter_mut().zip(panel.column(j)).enumerate() {
+                *entry = if row < j { 0.0 } else { *from };
+            }
         }
         true
     }
@@ -426,12 +422,7 @@ impl EliminateInputs<'_> {
             }
         }
         let stride = cost_to_go.stride();
-        let entries = cost_to_go.entries_mut();
-        for column in 1..states {
-            for row in 0..column {
-                entries[column * stride + row] = entries[row * stride + column];
-            }
-        }
+        mirror(cost_to_go.entries_mut(), stride, states);
     }
 
     /// `K' = -Y' L⁻¹`, from the last column to the first.

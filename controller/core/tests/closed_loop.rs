@@ -1,4 +1,5 @@
 //! The loop closed on a plant whose foot cannot move. The ground wrench is watched, not enforced.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod atlas;
 
@@ -56,7 +57,7 @@ fn run(atlas: &Atlas, config: ControllerConfig, seconds: f64, push: Option<Push>
     for tick in 0..(seconds * 1e9) as u64 / STEP_NS {
         let now = tick * STEP_NS;
         let time = now as f64 * 1e-9;
-        if now % period_ns == 0 {
+        if now.is_multiple_of(period_ns) {
             if let Some(command) = pending.take() {
                 plant.command = Some(command);
             }

@@ -1,4 +1,5 @@
 //! Optimality of the Riccati recursion and of the projected QP on random problems.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod random_problem;
 
@@ -106,7 +107,7 @@ fn the_cost_to_go_is_the_cost_that_follows() {
             x[i] * (0.5 * px + riccati.cost_to_go_gradient(0)[i])
         })
         .sum();
-    let difference = value(&x) - value(&vec![0.0; SIZE.states]);
+    let difference = value(&x) - value(&[0.0; SIZE.states]);
     assert!((difference - quadratic).abs() < 1e-11 * (1.0 + quadratic.abs()));
 }
 

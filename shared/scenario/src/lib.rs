@@ -20,6 +20,10 @@
 //! - [`Scenario::to_toml`] writes the *effective* configuration: every key, in the same format, readable again.
 //!
 //! Reading order: `scenario` (the keys), `range` (their rules), `document` (text to scenario), `error`.
+#![allow(
+    clippy::result_large_err,
+    reason = "an error here ends the reading of a file; its size costs nothing"
+)]
 
 mod document;
 mod error;

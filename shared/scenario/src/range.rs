@@ -54,7 +54,8 @@ pub(crate) fn check(scenario: &Scenario) -> Result<(), Violation> {
     let cycle = 1.0 / (controller.mpc_rate_hz * plant.step_s);
     whole("controller.mpc_rate_hz", controller.mpc_rate_hz, "plant.step_s", cycle)?;
     let servo = controller.servo_rate_hz;
-    if !((servo * plant.step_s - 1.0).abs() <= WHOLE_STEPS) {
+    let off = (servo * plant.step_s - 1.0).abs();
+    if off > WHOLE_STEPS || off.is_nan() {
         let rule = "the servo acts in every plant step";
         let remedy = format!("give 1 / `plant.step_s` = {}", 1.0 / plant.step_s);
         return Err(violation("controller.servo_rate_hz", servo.to_string(), rule, &remedy));

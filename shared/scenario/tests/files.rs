@@ -1,4 +1,5 @@
 //! Scenario files as people write them, right and wrong.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::result_large_err)]
 
 use delmpc_scenario::{Clock, ControllerKind, Document, Place, Scenario, ScenarioError};
 
