@@ -11,8 +11,8 @@
 //! Without the default feature `clarabel` the crate is `no_std` and needs `alloc` in constructors only; the QP is then solved by
 //! [`active_set_dual`].
 //!
-//! Reading order: [`model`], [`config`], [`cycle`]; then in the order of the cycle [`estimator`], [`plan`], [`stage_dynamics`],
-//! [`node_kinematics`], [`tasks`], [`reference`], [`contact_wrench`], [`lq_problem`], [`riccati`], [`dare`], [`projected_qp`],
+//! Reading order: [`model`], [`config`], [`cycle`]; then in the order of the cycle [`estimator`], [`plan`], [`horizon_dynamics`], [`stage_dynamics`],
+//! [`node_kinematics`], [`tasks`], [`mod@reference`], [`contact_wrench`], [`lq_problem`], [`riccati`], [`dare`], [`projected_qp`],
 //! [`dual_qp`], [`fallback`].
 #![allow(clippy::needless_range_loop)]
 #![cfg_attr(not(feature = "std"), no_std)]

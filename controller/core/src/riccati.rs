@@ -11,7 +11,7 @@
 //! the leading part of a block Cholesky factorisation: `P_k` comes out symmetric by construction (one triangle is computed and
 //! mirrored). The factors `L` stay for the constrained problem ([`crate::projected_qp`]).
 //!
-//! All matrices are column panels with rows in registers ([`crate::panel`]). With `T' = [B A]'` as a panel (rows `z`), the stage is
+//! All matrices are column panels with rows in registers (file `panel.rs`). With `T' = [B A]'` as a panel (rows `z`), the stage is
 //! `W = T' P`, the columns of `u` of `M = [R S; S' Q] + T' W'`, their Cholesky panel `(L; Y')`, and
 //! `P_k = Q - Y'Y + T_x' W_x'` in one pass over its lower triangle. The linear terms are one more row of the same panels, the row of
 //! a constant state 1: `d'` in `T'`, `(r, q)' + p'[B A]` in `M`; then `p_k` and `k` come out as that row of `P_k` and `K'`.
