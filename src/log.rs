@@ -279,6 +279,7 @@ float64[32] torque_lower
 float64[32] torque_upper
 float64[32] position_ref
 float64[32] velocity_ref
+float64[32] acceleration_ref
 float64[2048] gain
 delmpc_msgs/CycleReport report
 ";
@@ -429,6 +430,7 @@ mod tests {
                 torque_upper,
                 position_ref,
                 velocity_ref,
+                acceleration_ref,
                 gain,
                 report,
             ]

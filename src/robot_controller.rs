@@ -110,8 +110,9 @@ fn config(scenario: &Scenario) -> ControllerConfig {
             ControllerKind::Off => core::ControllerKind::Off,
         },
         period_s,
+        servo_period_s: 1.0 / settings.servo_rate_hz,
         delay_s: f64::from(settings.delay_cycles) * period_s + delays_s,
-        stages: ControllerConfig::stages_for(settings.horizon_s, settings.stages),
+        stages: ControllerConfig::stages_for(settings.horizon_s, settings.stages, period_s),
         weights: TaskWeights {
             posture: weights.posture_per_rad2,
             joint_speed: weights.joint_speed_s2_per_rad2,

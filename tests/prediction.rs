@@ -33,7 +33,8 @@ struct Prediction {
     wrench: [f64; 6],
 }
 
-/// Without noise, while the robot reaches for the ball: the state one stage ahead within 1e-3, the ground's wrench within 2 %.
+/// Without noise, while the robot reaches for the ball: the state `(q, q̇)` one stage ahead within 1e-3 of its length, the ground's wrench
+/// within 2 % of the largest. The stage is the first one, which is as long as a command holds; the servo works on it meanwhile.
 #[test]
 fn the_plan_says_where_the_plant_will_be() {
     let setup = setup(&["sensors.noise_scale=0", "clock=lockstep", "reach.start_s=0.2"]);
@@ -74,8 +75,7 @@ fn the_plan_says_where_the_plant_will_be() {
 
     let model = controller.core().model();
     let at = |time_ns: u64| history.iter().position(|truth| truth.time_ns == time_ns);
-    let (mut checked, mut worst_q, mut worst_rate, mut worst_wrench) = (0, 0.0_f64, 0.0_f64, 0.0_f64);
-    let largest_rate = history.iter().flat_map(|truth| truth.velocity).fold(0.0, |m: f64, v| m.max(v.abs()));
+    let (mut checked, mut worst_q, mut worst_state, mut worst_wrench) = (0, 0.0_f64, 0.0_f64, 0.0_f64);
     let mut wrench_scale = [0.0_f64; 2];
     let mut wrench_errors = Vec::new();
     for prediction in &predictions {
@@ -83,11 +83,10 @@ fn the_plan_says_where_the_plant_will_be() {
         checked += 1;
         let n = model.message_joint.len();
         let truth = &history[end];
-        let size = norm(truth.position[..n].iter().copied());
         let q = (0..n).map(|i| prediction.state[i] - truth.position[model.message_joint[i]]);
         let rate = (0..n).map(|i| prediction.state[n + i] - truth.velocity[model.message_joint[i]]);
-        worst_q = worst_q.max(norm(q) / size);
-        worst_rate = worst_rate.max(norm(rate) / largest_rate);
+        worst_q = worst_q.max(norm(q.clone()) / norm(truth.position[..n].iter().copied()));
+        worst_state = worst_state.max(norm(q.chain(rate)) / norm(prediction.state.iter().copied()));
 
         // Of a truth the wrench is that of the step that ended then; the predicted one is the mean over the stage.
         let steps = &history[begin + 1..=end];
@@ -108,9 +107,9 @@ fn the_plan_says_where_the_plant_will_be() {
             worst_wrench = worst_wrench.max(norm(error[range].iter().copied()) / wrench_scale[part]);
         }
     }
-    println!("{checked} stages: q {worst_q:.1e}, rates {worst_rate:.1e}, wrench {worst_wrench:.1e}");
+    println!("{checked} stages: q {worst_q:.1e}, state {worst_state:.1e}, wrench {worst_wrench:.1e}");
     assert!(checked > 200);
-    assert!(worst_q <= 1e-3 && worst_rate <= 1e-3, "q {worst_q:.2e}, rates {worst_rate:.2e}");
+    assert!(worst_q <= 1e-5 && worst_state <= 1e-3, "q {worst_q:.2e}, state {worst_state:.2e}");
     assert!(worst_wrench <= 0.02, "wrench {worst_wrench:.3e}");
 }
 

@@ -19,7 +19,7 @@ use delmpc_messages::{Command, FallbackLevel, MAX_JOINTS, MessageError, Verdict}
 
 use crate::error::{PlantError, require, require_length};
 
-/// `u = torque + gain [q - position_ref; q̇ - velocity_ref]` between `lower` and `upper`.
+/// `u = torque + gain [q - q_ref(t); q̇ - q̇_ref(t)]` between `lower` and `upper`, with a reference that moves at constant acceleration.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AffineLaw {
     /// Feed-forward torque.
@@ -32,6 +32,8 @@ pub struct AffineLaw {
     pub position_ref: Vec<f64>,
     /// Reference velocities.
     pub velocity_ref: Vec<f64>,
+    /// Reference accelerations.
+    pub acceleration_ref: Vec<f64>,
     /// Row-major, joints x (2 joints): positions, then velocities.
     pub gain: Vec<f64>,
 }
@@ -45,7 +47,8 @@ impl AffineLaw {
             lower: vec![f64::NEG_INFINITY; joints],
             upper: vec![f64::INFINITY; joints],
             position_ref: zero.clone(),
-            velocity_ref: zero,
+            velocity_ref: zero.clone(),
+            acceleration_ref: zero,
             gain: vec![0.0; 2 * joints * joints],
         }
     }
@@ -63,15 +66,17 @@ impl AffineLaw {
         law
     }
 
-    /// The torque at a measured state. O(n²), no allocation.
-    pub fn torque_into(&self, position: &[f64], velocity: &[f64], torque: &mut [f64]) {
+    /// The torque at a measured state, `elapsed_s` after the law began. O(n²), no allocation.
+    pub fn torque_into(&self, elapsed_s: f64, position: &[f64], velocity: &[f64], torque: &mut [f64]) {
         let n = self.torque.len();
         for (i, out) in torque.iter_mut().enumerate() {
             let row = &self.gain[i * 2 * n..(i + 1) * 2 * n];
             let mut sum = self.torque[i];
             for j in 0..n {
-                sum += row[j] * (position[j] - self.position_ref[j]);
-                sum += row[n + j] * (velocity[j] - self.velocity_ref[j]);
+                let (speed, acceleration) = (self.velocity_ref[j], self.acceleration_ref[j]);
+                let way = elapsed_s * (speed + 0.5 * elapsed_s * acceleration);
+                sum += row[j] * (position[j] - self.position_ref[j] - way);
+                sum += row[n + j] * (velocity[j] - speed - elapsed_s * acceleration);
             }
             *out = sum.max(self.lower[i]).min(self.upper[i]);
         }
@@ -84,6 +89,7 @@ impl AffineLaw {
         self.upper.copy_from_slice(&command.torque_upper[..n]);
         self.position_ref.copy_from_slice(&command.position_ref[..n]);
         self.velocity_ref.copy_from_slice(&command.velocity_ref[..n]);
+        self.acceleration_ref.copy_from_slice(&command.acceleration_ref[..n]);
         for (i, row) in self.gain.chunks_exact_mut(2 * n).enumerate() {
             row[..n].copy_from_slice(&command.gain[i][..n]);
             row[n..].copy_from_slice(&command.gain[i][MAX_JOINTS..MAX_JOINTS + n]);
@@ -91,7 +97,14 @@ impl AffineLaw {
     }
 
     fn check(&self, joints: usize) -> Result<(), PlantError> {
-        for list in [&self.torque, &self.lower, &self.upper, &self.position_ref, &self.velocity_ref] {
+        for list in [
+            &self.torque,
+            &self.lower,
+            &self.upper,
+            &self.position_ref,
+            &self.velocity_ref,
+            &self.acceleration_ref,
+        ] {
             require_length("static law", list.len(), joints)?;
         }
         require_length("gain of the static law", self.gain.len(), 2 * joints * joints)
@@ -305,9 +318,11 @@ impl Servo {
         match (self.level, slot, &self.config.law) {
             (FallbackLevel::ZeroTorque, None, _) => torque.fill(0.0),
             (level, Some(slot), _) if self.follows(level, now_ns) => {
-                slot.law.torque_into(position, velocity, torque);
+                // What ran out goes no farther.
+                let elapsed_ns = now_ns.min(slot.valid_until_ns).saturating_sub(slot.valid_from_ns);
+                slot.law.torque_into(elapsed_ns as f64 * 1e-9, position, velocity, torque);
             }
-            (FallbackLevel::StaticLqr, _, Some(law)) => law.torque_into(position, velocity, torque),
+            (FallbackLevel::StaticLqr, _, Some(law)) => law.torque_into(0.0, position, velocity, torque),
             (FallbackLevel::GravityHold, Some(slot), _) => {
                 for (i, out) in torque.iter_mut().enumerate() {
                     *out = slot.law.torque[i]

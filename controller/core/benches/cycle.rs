@@ -34,7 +34,7 @@ fn main() {
     let atlas = atlas();
     for stages in [10, 20, 40] {
         let config = ControllerConfig {
-            stages: ControllerConfig::stages_for(1.0, stages),
+            stages: ControllerConfig::stages_for(1.0, stages, 0.005),
             ..ControllerConfig::default()
         };
         let mut controller = Controller::new(atlas.controller_model(), config).unwrap();

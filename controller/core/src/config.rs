@@ -75,6 +75,8 @@ pub struct ControllerConfig {
     pub kind: ControllerKind,
     /// Time between cycles, s.
     pub period_s: f64,
+    /// Time between two evaluations of the command's feedback law in the plant, s.
+    pub servo_period_s: f64,
     /// From the time of a measurement to the time its command takes effect, s.
     pub delay_s: f64,
     /// The horizon, fine stages first.
@@ -105,8 +107,9 @@ impl Default for ControllerConfig {
         Self {
             kind: ControllerKind::Mpc,
             period_s: 0.005,
+            servo_period_s: 0.001,
             delay_s: 0.005,
-            stages: Self::stages_for(1.0, 20),
+            stages: Self::stages_for(1.0, 20, 0.005),
             weights: TaskWeights::default(),
             constraints: ConstraintConfig::default(),
             qp: ProjectedQpOptions::default(),
@@ -121,14 +124,16 @@ impl Default for ControllerConfig {
 }
 
 impl ControllerConfig {
-    /// Stage lengths for a horizon of `horizon_s` in `count` stages: about a third of them fine (10 ms in a horizon of 1 s), a
-    /// quarter twice as long, the rest equal and coarse.
-    pub fn stages_for(horizon_s: f64, count: usize) -> Vec<StageBlock> {
-        let (fine, middle) = (count * 3 / 10, count / 4);
-        let coarse = count.saturating_sub(fine + middle).max(1);
+    /// Stage lengths for a horizon of `horizon_s` in `count` stages: the first one as long as its torque is held, a period; then about
+    /// a quarter fine (10 ms in a horizon of 1 s), a quarter twice as long, the rest equal and coarse.
+    pub fn stages_for(horizon_s: f64, count: usize, period_s: f64) -> Vec<StageBlock> {
+        let (fine, middle) = ((count * 3 / 10).saturating_sub(1), count / 4);
+        let coarse = count.saturating_sub(1 + fine + middle).max(1);
         let unit = horizon_s;
-        let rest = horizon_s - unit * (0.01 * fine as f64 + 0.02 * middle as f64);
+        let first = period_s.min(0.5 * horizon_s);
+        let rest = (horizon_s - first - unit * (0.01 * fine as f64 + 0.02 * middle as f64)).max(0.1 * unit);
         let blocks = [
+            StageBlock { count: 1, seconds: first },
             StageBlock { count: fine, seconds: 0.01 * unit },
             StageBlock { count: middle, seconds: 0.02 * unit },
             StageBlock { count: coarse, seconds: rest / coarse as f64 },
@@ -166,6 +171,7 @@ impl ControllerConfig {
             }
         };
         positive("period", self.period_s)?;
+        positive("servo period", self.servo_period_s)?;
         not_negative("delay", self.delay_s)?;
         positive("state age", self.max_state_age_s)?;
         positive("command life", self.command_life_s)?;

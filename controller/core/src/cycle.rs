@@ -71,8 +71,6 @@ const MISMATCH_CYCLES: u32 = 5;
 const DAMPING_FRACTION: f64 = 0.1;
 /// Distance of any joint from the home posture up to which the static LQR is trusted, rad or m.
 const LQR_REACH: f64 = 0.6;
-/// Longest substep of the prediction, s.
-const PREDICTION_STEP: f64 = 0.0025;
 
 /// Tells elapsed time, for the report only.
 pub trait Clock {
@@ -90,25 +88,35 @@ impl Clock for StoppedClock {
     }
 }
 
-/// A law the command can carry: `u = torque + gain (x - reference)` between bounds, in the order of the tree.
+/// A law the command can carry: `u = torque + gain (x - reference)` between bounds, in the order of the tree. The reference is that of
+/// the moment the law begins, from where it moves at constant acceleration.
 #[derive(Clone, Debug)]
 struct Law {
     torque: Vec<f64>,
     lower: Vec<f64>,
     upper: Vec<f64>,
     reference: Vec<f64>,
+    acceleration: Vec<f64>,
     gain: Mat<f64>,
 }
 
 impl Law {
     fn new(n: usize) -> Self {
         let (lower, upper) = (vec![0.0; n], vec![0.0; n]);
-        Self { torque: vec![0.0; n], lower, upper, reference: vec![0.0; 2 * n], gain: Mat::zeros(n, 2 * n) }
+        let (reference, acceleration) = (vec![0.0; 2 * n], vec![0.0; n]);
+        Self { torque: vec![0.0; n], lower, upper, reference, acceleration, gain: Mat::zeros(n, 2 * n) }
     }
 
-    fn torque_at(&self, x: &[f64], error: &mut [f64], torque: &mut [f64]) {
+    /// The torque at the state `x`, `elapsed_s` after the law began.
+    fn torque_at(&self, elapsed_s: f64, x: &[f64], error: &mut [f64], torque: &mut [f64]) {
+        let n = self.torque.len();
         for ((e, x), r) in error.iter_mut().zip(x).zip(&self.reference) {
             *e = x - r;
+        }
+        for j in 0..n {
+            let change = elapsed_s * self.acceleration[j];
+            error[j] -= elapsed_s * (self.reference[n + j] + 0.5 * change);
+            error[n + j] -= change;
         }
         torque.copy_from_slice(&self.torque);
         gemv(torque, faer::Accum::Add, self.gain.as_ref(), error, 1.0);
@@ -352,18 +360,20 @@ impl Controller {
         Ok(start_s)
     }
 
-    /// Moves `predicted` forward under the law of the last command.
+    /// Moves `predicted` forward under the law of the last command, in the steps of the servo: its gains are too stiff for longer ones.
     fn predict(&mut self, duration_s: f64) -> Result<(), ()> {
         if duration_s <= 0.0 || self.command.state_sequence == 0 {
             return Ok(());
         }
         let n = self.model.tree.dof();
-        let steps = libm::ceil(duration_s / PREDICTION_STEP - 1e-9).max(1.0);
+        let steps = libm::ceil(duration_s / self.config.servo_period_s - 1e-9).max(1.0);
         let time_step = duration_s / steps;
         let (error, rest) = self.scratch.split_at_mut(2 * n);
         let (torque, _) = rest.split_at_mut(n);
+        let mut elapsed_s = 0.0;
         for _ in 0..steps as usize {
-            self.law.torque_at(&self.predicted, error, torque);
+            self.law.torque_at(elapsed_s, &self.predicted, error, torque);
+            elapsed_s += time_step;
             let tree = &self.model.tree;
             self.dynamics.simulate(tree, &self.predicted, torque, time_step, error).map_err(|_| ())?;
             self.predicted.copy_from_slice(error);
@@ -556,6 +566,7 @@ impl Controller {
             let effort = limit.effort.min(LARGEST_EFFORT);
             (law.lower[j], law.upper[j]) = (-effort, effort);
         }
+        law.acceleration.fill(0.0);
         let effective = match (self.config.kind, level) {
             (ControllerKind::Off, _) => FallbackLevel::ZeroTorque,
             (ControllerKind::StaticLqr, FallbackLevel::FreshSolution | FallbackLevel::ShiftedPlan) => {
@@ -567,8 +578,13 @@ impl Controller {
             FallbackLevel::FreshSolution | FallbackLevel::ShiftedPlan => {
                 let stage = self.plan.stage_at(time_s);
                 law.torque.copy_from_slice(self.plan.values.u.col_as_slice(stage));
-                // The law holds for a period: its reference is the plan's state half a period on.
-                self.plan.state_at(time_s + 0.5 * self.config.period_s, &mut law.reference);
+                // The law holds for a period, over which its reference goes from the plan's rates to the plan's rates.
+                let period_s = self.config.period_s;
+                self.plan.state_at(time_s + period_s, &mut self.scratch[..2 * n]);
+                self.plan.state_at(time_s, &mut law.reference);
+                for j in 0..n {
+                    law.acceleration[j] = (self.scratch[n + j] - law.reference[n + j]) / period_s;
+                }
                 law.gain.copy_from(self.riccati.gain(stage));
                 if level == FallbackLevel::FreshSolution {
                     let planned = (self.solution.u.as_ref(), self.solution.x.as_ref());
@@ -783,6 +799,7 @@ fn write_law(law: &Law, message_joint: &[usize], command: &mut Command) {
         command.torque_upper[joint] = law.upper[i];
         command.position_ref[joint] = law.reference[i];
         command.velocity_ref[joint] = law.reference[n + i];
+        command.acceleration_ref[joint] = law.acceleration[i];
         for (j, &column) in message_joint.iter().enumerate() {
             command.gain[joint][column] = law.gain[(i, j)];
             command.gain[joint][MAX_JOINTS + column] = law.gain[(i, n + j)];

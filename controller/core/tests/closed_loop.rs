@@ -203,7 +203,7 @@ fn it_survives_the_push_of_the_environment() {
     let mut config = ControllerConfig { period_s: period, delay_s: period, ..ControllerConfig::default() };
     let horizon = numbers("HORIZON", "0")[0];
     if horizon > 0.0 {
-        config.stages = ControllerConfig::stages_for(horizon, 20);
+        config.stages = ControllerConfig::stages_for(horizon, 20, 0.005);
     }
     let push = Push { impulse: Vector3::from_row_slice(&impulse), start_s: 0.2 };
     run(&atlas(), config, numbers("SECONDS_RUN", "2.5")[0], Some(push), std::env::var("VERBOSE").is_ok());

@@ -12,8 +12,9 @@ use crate::{
 
 /// The answer to one [`crate::PlantState`]: an affine feedback law with a time span in which it holds.
 ///
-/// The plant applies, at its own rate, `u = torque + gain [q - q_ref; q_dot - q_dot_ref]` between `torque_lower` and `torque_upper`
-/// ([`Self::torque_into`]), then its limits. The bounds keep what the feedback adds between two commands within what the controller
+/// The plant applies, at its own rate, `u = torque + gain [q - q_ref(t); q_dot - q_dot_ref(t)]` between `torque_lower`
+/// and `torque_upper` ([`Self::torque_into`]), then its limits. From `valid_from` on the reference moves with constant acceleration, so
+/// that a robot on its way is not held back by where it was. The bounds keep what the feedback adds between two commands within what the controller
 /// found admissible: those of the stance ankle keep the pressure point in the sole while the robot is being pushed.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
@@ -43,10 +44,12 @@ pub struct Command {
     pub torque_lower: [f64; MAX_JOINTS],
     /// Largest joint torque (N m or N).
     pub torque_upper: [f64; MAX_JOINTS],
-    /// Reference joint position (rad or m).
+    /// Reference joint position at `valid_from_ns` (rad or m).
     pub position_ref: [f64; MAX_JOINTS],
-    /// Reference joint velocity (rad/s or m/s).
+    /// Reference joint velocity at `valid_from_ns` (rad/s or m/s).
     pub velocity_ref: [f64; MAX_JOINTS],
+    /// Reference joint acceleration (rad/s² or m/s²).
+    pub acceleration_ref: [f64; MAX_JOINTS],
     /// Gain rows, one per joint. Column `j` multiplies the position error of joint j, column `MAX_JOINTS + j` its velocity error,
     /// whatever `n_joints` is.
     pub gain: [[f64; 2 * MAX_JOINTS]; MAX_JOINTS],
@@ -156,6 +159,7 @@ impl Command {
         }
         check::plausible(message, "position_ref", &self.position_ref[..n], LARGEST_COORDINATE)?;
         check::plausible(message, "velocity_ref", &self.velocity_ref[..n], LARGEST_COORDINATE)?;
+        check::plausible(message, "acceleration_ref", &self.acceleration_ref[..n], LARGEST_EFFORT)?;
         for (row, gain) in self.gain[..n].iter().enumerate() {
             for column in (0..n).chain(MAX_JOINTS..MAX_JOINTS + n) {
                 let index = row * 2 * MAX_JOINTS + column;
@@ -185,7 +189,8 @@ impl Command {
         (self.valid_from_ns..self.valid_until_ns).contains(&plant_time_ns)
     }
 
-    /// The torque of the feedback law at a measured state: `u = torque + gain [q - q_ref; q_dot - q_dot_ref]` within its bounds.
+    /// The torque of the feedback law at a measured state: `u = torque + gain [q - q_ref(t); q_dot - q_dot_ref(t)]` within its bounds,
+    /// `time_ns` by the plant's clock. Before and after its time the reference stands where it began and ended.
     ///
     /// Cost: O(n²), no allocation. Call it on a validated command.
     ///
@@ -193,6 +198,7 @@ impl Command {
     /// [`MessageError::WrongLength`] when a slice has another length than `n_joints`; `torque` is untouched then.
     pub fn torque_into(
         &self,
+        time_ns: u64,
         position: &[f64],
         velocity: &[f64],
         torque: &mut [f64],
@@ -205,12 +211,16 @@ impl Command {
                 return Err(MessageError::WrongLength { message: Self::NAME, argument, found, expected: n });
             }
         }
+        let elapsed_ns = time_ns.min(self.valid_until_ns).saturating_sub(self.valid_from_ns);
+        let elapsed_s = elapsed_ns as f64 * 1e-9;
         for (i, torque) in torque.iter_mut().enumerate() {
             let (position_gain, velocity_gain) = self.gain[i].split_at(MAX_JOINTS);
             *torque = self.torque[i];
             for j in 0..n {
-                *torque += position_gain[j] * (position[j] - self.position_ref[j]);
-                *torque += velocity_gain[j] * (velocity[j] - self.velocity_ref[j]);
+                let (speed, acceleration) = (self.velocity_ref[j], self.acceleration_ref[j]);
+                let way = elapsed_s * (speed + 0.5 * elapsed_s * acceleration);
+                *torque += position_gain[j] * (position[j] - self.position_ref[j] - way);
+                *torque += velocity_gain[j] * (velocity[j] - speed - elapsed_s * acceleration);
             }
             *torque = torque.max(self.torque_lower[i]).min(self.torque_upper[i]);
         }

@@ -44,7 +44,7 @@ fn plant_state_v1() {
 #[test]
 fn command_v2() {
     assert_eq!(Command::VERSION, 2);
-    assert_eq!((size_of::<Command>(), align_of::<Command>()), (17_848, 8));
+    assert_eq!((size_of::<Command>(), align_of::<Command>()), (18_104, 8));
     assert_eq!(offset_of!(Command, header), 0);
     assert_eq!(offset_of!(Command, state_sequence), 40);
     assert_eq!(offset_of!(Command, state_time_ns), 48);
@@ -59,8 +59,9 @@ fn command_v2() {
     assert_eq!(offset_of!(Command, torque_upper), 600);
     assert_eq!(offset_of!(Command, position_ref), 856);
     assert_eq!(offset_of!(Command, velocity_ref), 1112);
-    assert_eq!(offset_of!(Command, gain), 1368);
-    assert_eq!(offset_of!(Command, report), 17_752);
+    assert_eq!(offset_of!(Command, acceleration_ref), 1368);
+    assert_eq!(offset_of!(Command, gain), 1624);
+    assert_eq!(offset_of!(Command, report), 18_008);
 }
 
 #[test]

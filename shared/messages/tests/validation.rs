@@ -131,12 +131,13 @@ fn every_number_of_a_state_is_checked_by_name_and_index() {
 
 #[test]
 fn every_number_of_a_command_is_checked_by_name_and_index() {
-    let fields: [CommandField; 5] = [
+    let fields: [CommandField; 6] = [
         ("torque", |c| &mut c.torque),
         ("torque_lower", |c| &mut c.torque_lower),
         ("torque_upper", |c| &mut c.torque_upper),
         ("position_ref", |c| &mut c.position_ref),
         ("velocity_ref", |c| &mut c.velocity_ref),
+        ("acceleration_ref", |c| &mut c.acceleration_ref),
     ];
     for (value, kind) in BAD {
         for (name, field) in fields {
@@ -248,20 +249,35 @@ fn the_feedback_law_is_feed_forward_plus_gain_times_error() {
     command.gain[0][1] = 10.0;
     command.gain[2][MAX_JOINTS] = -4.0;
     let mut torque = [0.0; N];
-    command.torque_into(&[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0], &mut torque).unwrap();
+    command.torque_into(0, &[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0], &mut torque).unwrap();
     assert_eq!(torque, [1.0 + 10.0 * (0.7 - 0.2), 2.0, 3.0 - 4.0 * 2.0]);
+
+    // Half a second on the reference has moved, and at the end of its time it stops.
+    (command.valid_from_ns, command.valid_until_ns) = (1_000_000_000, 3_000_000_000);
+    command.velocity_ref[1] = 2.0;
+    command.acceleration_ref[..N].copy_from_slice(&[4.0, 8.0, 0.0]);
+    command.torque_into(1_500_000_000, &[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0], &mut torque).unwrap();
+    let moved = 0.5 * 2.0 + 0.125 * 8.0;
+    assert_eq!(torque, [1.0 + 10.0 * (0.7 - 0.2 - moved), 2.0, 3.0 - 4.0 * (1.0 - (-1.0) - 0.5 * 4.0)]);
+    let mut late = [0.0; N];
+    command.torque_into(3_000_000_000, &[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0], &mut torque).unwrap();
+    command.torque_into(9_000_000_000, &[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0], &mut late).unwrap();
+    assert_eq!(torque, late);
+    command.torque_upper[0] = -3.0;
+    command.torque_into(0, &[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0], &mut torque).unwrap();
+    assert_eq!(torque[0], -3.0);
 }
 
 #[test]
 fn the_feedback_law_refuses_slices_of_another_length_and_counts_beyond_the_capacity() {
     let mut command = command();
     let mut torque = [5.0; N];
-    let error = command.torque_into(&[0.0; 2], &[0.0; N], &mut torque).unwrap_err();
+    let error = command.torque_into(0, &[0.0; 2], &[0.0; N], &mut torque).unwrap_err();
     assert!(matches!(error, MessageError::WrongLength { argument: "position", found: 2, expected: 3, .. }));
     assert_eq!(torque, [5.0; N], "a refused call changes nothing");
 
     command.n_joints = 1_000;
-    assert!(command.torque_into(&[0.0; 1_000], &[0.0; 1_000], &mut [0.0; 1_000]).is_err());
+    assert!(command.torque_into(0, &[0.0; 1_000], &[0.0; 1_000], &mut [0.0; 1_000]).is_err());
 }
 
 #[test]

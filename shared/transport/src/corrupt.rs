@@ -56,6 +56,7 @@ impl Corrupt for Command {
             &mut self.torque_upper[..n],
             &mut self.position_ref[..n],
             &mut self.velocity_ref[..n],
+            &mut self.acceleration_ref[..n],
             &mut position_gain[..n],
             &mut velocity_gain[..n],
         ];

@@ -122,7 +122,7 @@ impl WeldedPlant {
         }
         let mut message_torque = vec![0.0; n];
         if let Some(command) = &self.command {
-            command.torque_into(&position, &velocity, &mut message_torque).unwrap();
+            command.torque_into(self.time_ns, &position, &velocity, &mut message_torque).unwrap();
         }
         for (i, &joint) in self.model.message_joint.iter().enumerate() {
             let limit = self.model.limits[i].effort;
