@@ -118,6 +118,7 @@ impl Supervision {
             }
         }
         let ids = ProcessIds { plant: processes[0].child.id(), controller: processes[1].child.id() };
+        say(&messages, &format!("run: plant process {}, controller process {}", ids.plant, ids.controller));
         let begin = monotonic_ns();
         let course = loop {
             if stop.is_set() {
@@ -244,12 +245,17 @@ fn end_all(processes: &mut [Watched], presence: &mut Presence) {
     }
 }
 
+/// Keeps a line with what the processes say.
+fn say(messages: &Mutex<File>, line: &str) {
+    let mut file = messages.lock().unwrap_or_else(PoisonError::into_inner);
+    let _ = writeln!(file, "{line}");
+}
+
 /// Keeps what a process says, line by line, and shows it.
 fn pass_on(role: Role, stream: impl Read, messages: &Mutex<File>, show: bool) {
     for line in BufReader::new(stream).split(b'\n').map_while(Result::ok) {
         let line = String::from_utf8_lossy(&line);
-        let mut file = messages.lock().unwrap_or_else(PoisonError::into_inner);
-        let _ = writeln!(file, "{}: {line}", role.name());
+        say(messages, &format!("{}: {line}", role.name()));
         if show {
             let mut stderr = std::io::stderr();
             let clear = if stderr.is_terminal() { "\r\x1b[K" } else { "" };

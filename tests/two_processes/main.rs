@@ -54,6 +54,10 @@ fn a_short_run_ends_well_and_leaves_nothing_behind() {
         assert!(folder.path().join(file).is_file(), "{file}");
     }
     assert_eq!(folder.summary()["steps"], 200);
+    let messages = fs::read_to_string(folder.path().join("messages.txt")).unwrap();
+    let (plant, controller) = (member(&family, "plant").pid, member(&family, "controller").pid);
+    let line = format!("run: plant process {plant}, controller process {controller}");
+    assert!(messages.contains(&line), "{messages}");
 }
 
 #[test]
