@@ -80,7 +80,6 @@ impl Log {
         let mut writer = WriteOptions::new()
             .compression(Some(Compression::Lz4))
             .profile("ros2")
-            .library("delmpc")
             .create(BufWriter::new(file))
             .map_err(|error| cannot(&error))?;
         let metadata = Metadata { name: "run".to_owned(), metadata: head.about };
