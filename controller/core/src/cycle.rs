@@ -15,9 +15,7 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use delmpc_mechanics::inverse_dynamics::{InverseDynamicsWorkspace, gravity_force_into};
-use delmpc_messages::{
-    Command, ConstraintKind, CycleReport, FallbackLevel, LARGEST_EFFORT, MAX_JOINTS, PlantState, Verdict,
-};
+use delmpc_messages::{Command, CycleReport, FallbackLevel, LARGEST_EFFORT, PlantState, Verdict};
 use faer::{Mat, MatRef};
 use nalgebra::Vector3;
 
@@ -28,6 +26,7 @@ use crate::dual_qp::QpSolver;
 use crate::errors::ControlError;
 use crate::estimator::{Estimate, Estimator};
 use crate::fallback::{Attempt, FallbackLadder, Situation};
+use crate::feedback_law::{Law, bound_by_pressure_point, write_law};
 use crate::horizon_dynamics::HorizonDynamics;
 use crate::kernels::{all_finite, gemv};
 use crate::lq_problem::{LqProblem, LqSize, LqStage};
@@ -39,6 +38,8 @@ use crate::projected_qp::{ProjectedQp, ProjectedQpReport, default_backend};
 use crate::reference::{Reach, Reference};
 use crate::riccati::{Riccati, Trajectory};
 use crate::stage_dynamics::StageDynamics;
+use crate::stop_watch::StopWatch;
+pub use crate::stop_watch::{Clock, StoppedClock};
 use crate::tasks::{TaskTargets, Tasks};
 
 /// Reasons for refusing a state that are the controller's own ([`Command::reason`]); below 100 they are the message's.
@@ -71,60 +72,6 @@ const MISMATCH_CYCLES: u32 = 5;
 const DAMPING_FRACTION: f64 = 0.1;
 /// Distance of any joint from the home posture up to which the static LQR is trusted, rad or m.
 const LQR_REACH: f64 = 0.6;
-
-/// Tells elapsed time, for the report only.
-pub trait Clock {
-    /// Monotonic time, ns.
-    fn now_ns(&self) -> u64;
-}
-
-/// A clock that stands still: for reproducible runs.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct StoppedClock;
-
-impl Clock for StoppedClock {
-    fn now_ns(&self) -> u64 {
-        0
-    }
-}
-
-/// A law the command can carry: `u = torque + gain (x - reference)` between bounds, in the order of the tree. The reference is that of
-/// the moment the law begins, from where it moves at constant acceleration.
-#[derive(Clone, Debug)]
-struct Law {
-    torque: Vec<f64>,
-    lower: Vec<f64>,
-    upper: Vec<f64>,
-    reference: Vec<f64>,
-    acceleration: Vec<f64>,
-    gain: Mat<f64>,
-}
-
-impl Law {
-    fn new(n: usize) -> Self {
-        let (lower, upper) = (vec![0.0; n], vec![0.0; n]);
-        let (reference, acceleration) = (vec![0.0; 2 * n], vec![0.0; n]);
-        Self { torque: vec![0.0; n], lower, upper, reference, acceleration, gain: Mat::zeros(n, 2 * n) }
-    }
-
-    /// The torque at the state `x`, `elapsed_s` after the law began.
-    fn torque_at(&self, elapsed_s: f64, x: &[f64], error: &mut [f64], torque: &mut [f64]) {
-        let n = self.torque.len();
-        for ((e, x), r) in error.iter_mut().zip(x).zip(&self.reference) {
-            *e = x - r;
-        }
-        for j in 0..n {
-            let change = elapsed_s * self.acceleration[j];
-            error[j] -= elapsed_s * (self.reference[n + j] + 0.5 * change);
-            error[n + j] -= change;
-        }
-        torque.copy_from_slice(&self.torque);
-        gemv(torque, faer::Accum::Add, self.gain.as_ref(), error, 1.0);
-        for ((u, lower), upper) in torque.iter_mut().zip(&self.lower).zip(&self.upper) {
-            *u = u.max(*lower).min(*upper);
-        }
-    }
-}
 
 /// The controller: everything it needs for a cycle, allocated once.
 #[derive(Debug)]
@@ -739,38 +686,6 @@ const LEVELS: [FallbackLevel; 6] = [
     FallbackLevel::ZeroTorque,
 ];
 
-/// Keeps what the feedback adds between two cycles from driving the pressure point over the edge of the sole.
-///
-/// A row `g'u + .. <= bound` of the pressure point has a slack in the plan; the joint that moves it most, an ankle, may use up that
-/// slack and no more. A push acts on the state, not on the torque of the ankle, so this holds while the robot is being pushed.
-fn bound_by_pressure_point(
-    stage: &LqStage,
-    index: usize,
-    (u, x): (MatRef<'_, f64>, MatRef<'_, f64>),
-    law: &mut Law,
-) {
-    let n = law.torque.len();
-    for row in 0..stage.row_count {
-        if stage.row_tag[row].kind != ConstraintKind::CentreOfPressure {
-            continue;
-        }
-        let coefficients = stage.rows.col_as_slice(row);
-        let by_input = (0..n).map(|j| coefficients[j] * u[(j, index)]);
-        let by_state = (0..2 * n).map(|i| coefficients[n + i] * x[(i, index)]);
-        let slack = (stage.row_bound[row] - by_input.sum::<f64>() - by_state.sum::<f64>()).max(0.0);
-        let largest = (0..n).max_by(|a, b| coefficients[*a].abs().total_cmp(&coefficients[*b].abs()));
-        if let Some(j) = largest.filter(|j| coefficients[*j].abs() > f64::EPSILON) {
-            let room = slack / coefficients[j];
-            let (planned, lower, upper) = (law.torque[j], &mut law.lower[j], &mut law.upper[j]);
-            if room >= 0.0 && coefficients[j] > 0.0 {
-                *upper = upper.min(planned + room).max(*lower);
-            } else {
-                *lower = lower.max(planned + room).min(*upper);
-            }
-        }
-    }
-}
-
 /// Torque limits as bounds on the deviation from the nominal torque.
 fn bound_inputs(model: &ControllerModel, fraction: f64, nominal: &[f64], stage: &mut LqStage) {
     for (j, limit) in model.limits.iter().enumerate() {
@@ -790,43 +705,6 @@ fn bound_state(model: &ControllerModel, nominal: &[f64], bounds: &mut crate::lq_
     }
 }
 
-/// Writes a law in the order of the messages.
-fn write_law(law: &Law, message_joint: &[usize], command: &mut Command) {
-    let n = message_joint.len();
-    for (i, &joint) in message_joint.iter().enumerate() {
-        command.torque[joint] = law.torque[i];
-        command.torque_lower[joint] = law.lower[i];
-        command.torque_upper[joint] = law.upper[i];
-        command.position_ref[joint] = law.reference[i];
-        command.velocity_ref[joint] = law.reference[n + i];
-        command.acceleration_ref[joint] = law.acceleration[i];
-        for (j, &column) in message_joint.iter().enumerate() {
-            command.gain[joint][column] = law.gain[(i, j)];
-            command.gain[joint][MAX_JOINTS + column] = law.gain[(i, n + j)];
-        }
-    }
-}
-
 fn to_ns(seconds: f64) -> u64 {
     libm::round(seconds * 1e9) as u64
-}
-
-/// Times the steps of a cycle.
-struct StopWatch<'a> {
-    clock: &'a dyn Clock,
-    last: u64,
-}
-
-impl<'a> StopWatch<'a> {
-    fn start(clock: &'a dyn Clock) -> Self {
-        Self { clock, last: clock.now_ns() }
-    }
-
-    /// Time since the last call, ns.
-    fn lap(&mut self) -> u64 {
-        let now = self.clock.now_ns();
-        let lap = now.saturating_sub(self.last);
-        self.last = now;
-        lap
-    }
 }

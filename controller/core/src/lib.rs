@@ -30,9 +30,11 @@ pub mod contact_wrench;
 pub mod cycle;
 pub mod dare;
 pub mod dual_qp;
+mod eliminate_inputs;
 pub mod errors;
 pub mod estimator;
 pub mod fallback;
+mod feedback_law;
 pub mod horizon_dynamics;
 pub(crate) mod kernels;
 pub mod lq_problem;
@@ -47,6 +49,7 @@ pub mod riccati;
 #[cfg(feature = "clarabel")]
 pub mod sparse_qp;
 pub mod stage_dynamics;
+mod stop_watch;
 pub mod tasks;
 
 /// What a process needs to run a controller.

@@ -1,0 +1,109 @@
+//! The feedback law a command carries to the servo: torque, gain, a moving reference, and bounds.
+//!
+//! | letter | meaning | unit |
+//! |---|---|---|
+//! | `u`, `K` | torque at the reference, gain on `(q, q̇)` | N·m, N·m/rad, N·m·s/rad |
+//! | `x_ref(t)` | reference state, moving at constant acceleration | rad, rad/s |
+//! | `[u_lower, u_upper]` | bounds | N·m |
+//!
+//! ```text
+//! u(t) = clamp(u + K (x - x_ref(t)), u_lower, u_upper)
+//! ```
+//!
+//! (N, N/m and so on for prismatic joints.) Source: own formulation; the gain is that of the Riccati recursion ([`crate::riccati`]).
+
+use alloc::vec;
+use alloc::vec::Vec;
+
+use delmpc_messages::{Command, ConstraintKind, MAX_JOINTS};
+use faer::{Mat, MatRef};
+
+use crate::kernels::gemv;
+use crate::lq_problem::LqStage;
+
+/// A law the command can carry: `u = torque + gain (x - reference)` between bounds, in the order of the tree. The reference is that of
+/// the moment the law begins, from where it moves at constant acceleration.
+#[derive(Clone, Debug)]
+pub(crate) struct Law {
+    pub torque: Vec<f64>,
+    pub lower: Vec<f64>,
+    pub upper: Vec<f64>,
+    pub reference: Vec<f64>,
+    pub acceleration: Vec<f64>,
+    pub gain: Mat<f64>,
+}
+
+impl Law {
+    pub fn new(n: usize) -> Self {
+        let (lower, upper) = (vec![0.0; n], vec![0.0; n]);
+        let (reference, acceleration) = (vec![0.0; 2 * n], vec![0.0; n]);
+        Self { torque: vec![0.0; n], lower, upper, reference, acceleration, gain: Mat::zeros(n, 2 * n) }
+    }
+
+    /// The torque at the state `x`, `elapsed_s` after the law began.
+    pub fn torque_at(&self, elapsed_s: f64, x: &[f64], error: &mut [f64], torque: &mut [f64]) {
+        let n = self.torque.len();
+        for ((e, x), r) in error.iter_mut().zip(x).zip(&self.reference) {
+            *e = x - r;
+        }
+        for j in 0..n {
+            let change = elapsed_s * self.acceleration[j];
+            error[j] -= elapsed_s * (self.reference[n + j] + 0.5 * change);
+            error[n + j] -= change;
+        }
+        torque.copy_from_slice(&self.torque);
+        gemv(torque, faer::Accum::Add, self.gain.as_ref(), error, 1.0);
+        for ((u, lower), upper) in torque.iter_mut().zip(&self.lower).zip(&self.upper) {
+            *u = u.max(*lower).min(*upper);
+        }
+    }
+}
+
+/// Keeps what the feedback adds between two cycles from driving the pressure point over the edge of the sole.
+///
+/// A row `g'u + .. <= bound` of the pressure point has a slack in the plan; the joint that moves it most, an ankle, may use up that
+/// slack and no more. A push acts on the state, not on the torque of the ankle, so this holds while the robot is being pushed.
+pub(crate) fn bound_by_pressure_point(
+    stage: &LqStage,
+    index: usize,
+    (u, x): (MatRef<'_, f64>, MatRef<'_, f64>),
+    law: &mut Law,
+) {
+    let n = law.torque.len();
+    for row in 0..stage.row_count {
+        if stage.row_tag[row].kind != ConstraintKind::CentreOfPressure {
+            continue;
+        }
+        let coefficients = stage.rows.col_as_slice(row);
+        let by_input = (0..n).map(|j| coefficients[j] * u[(j, index)]);
+        let by_state = (0..2 * n).map(|i| coefficients[n + i] * x[(i, index)]);
+        let slack = (stage.row_bound[row] - by_input.sum::<f64>() - by_state.sum::<f64>()).max(0.0);
+        let largest = (0..n).max_by(|a, b| coefficients[*a].abs().total_cmp(&coefficients[*b].abs()));
+        if let Some(j) = largest.filter(|j| coefficients[*j].abs() > f64::EPSILON) {
+            let room = slack / coefficients[j];
+            let (planned, lower, upper) = (law.torque[j], &mut law.lower[j], &mut law.upper[j]);
+            if room >= 0.0 && coefficients[j] > 0.0 {
+                *upper = upper.min(planned + room).max(*lower);
+            } else {
+                *lower = lower.max(planned + room).min(*upper);
+            }
+        }
+    }
+}
+
+/// Writes a law in the order of the messages.
+pub(crate) fn write_law(law: &Law, message_joint: &[usize], command: &mut Command) {
+    let n = message_joint.len();
+    for (i, &joint) in message_joint.iter().enumerate() {
+        command.torque[joint] = law.torque[i];
+        command.torque_lower[joint] = law.lower[i];
+        command.torque_upper[joint] = law.upper[i];
+        command.position_ref[joint] = law.reference[i];
+        command.velocity_ref[joint] = law.reference[n + i];
+        command.acceleration_ref[joint] = law.acceleration[i];
+        for (j, &column) in message_joint.iter().enumerate() {
+            command.gain[joint][column] = law.gain[(i, j)];
+            command.gain[joint][MAX_JOINTS + column] = law.gain[(i, n + j)];
+        }
+    }
+}
