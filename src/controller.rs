@@ -53,6 +53,7 @@ pub fn controller(arguments: &PartArguments, allocations: fn() -> u64) -> Result
 pub fn part(scenario: &Scenario, figures: &CycleFigures) -> ControllerPart {
     let realtime = scenario.clock == Clock::Realtime;
     let [p50, p99, p999, max] = figures.percentiles_s(|cycle| cycle.total_ns, [0.5, 0.99, 0.999, 1.0]);
+    let [feedback_p50, feedback_p99] = figures.percentiles_s(|cycle| cycle.feedback_ns, [0.5, 0.99]);
     let [linearize] = figures.percentiles_s(|cycle| cycle.linearize_ns, [0.5]);
     let [riccati] = figures.percentiles_s(|cycle| cycle.riccati_ns, [0.5]);
     let [qp] = figures.percentiles_s(|cycle| cycle.qp_ns, [0.5]);
@@ -64,6 +65,8 @@ pub fn part(scenario: &Scenario, figures: &CycleFigures) -> ControllerPart {
         cycle_time_p99_s: timed(p99),
         cycle_time_p999_s: timed(p999),
         cycle_time_max_s: timed(max),
+        feedback_p50_s: timed(feedback_p50),
+        feedback_p99_s: timed(feedback_p99),
         linearize_p50_s: timed(linearize),
         riccati_p50_s: timed(riccati),
         qp_p50_s: timed(qp),

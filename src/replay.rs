@@ -114,6 +114,7 @@ fn compare(setup: &Setup, log: &[u8], file: &Path) -> Result<Result<Compared, St
                     });
                     if !logged.has_status(status::FINISHED) {
                         controller.cycle(&logged, logged.time_ns + delay_ns, answer);
+                        controller.prepare();
                         address(answer, &logged);
                     }
                 }

@@ -54,12 +54,20 @@ impl RobotController {
 
 impl Controller for RobotController {
     fn cycle(&mut self, state: &PlantState, now_ns: u64, command: &mut Command) {
-        let clock: &dyn CycleClock = if self.realtime { &WallClock } else { &core::StoppedClock };
         let (header, publish_ns) = (command.header, command.report.publish_ns);
-        *command = *self.controller.cycle(state, now_ns, clock);
+        *command = *self.controller.cycle(state, now_ns, clock(self.realtime));
         command.header = header;
         command.report.publish_ns = publish_ns;
     }
+
+    fn prepare(&mut self) {
+        self.controller.prepare(clock(self.realtime));
+    }
+}
+
+/// In lockstep nothing that depends on a clock enters the command.
+fn clock(realtime: bool) -> &'static dyn CycleClock {
+    if realtime { &WallClock } else { &core::StoppedClock }
 }
 
 /// The robot fixed at its stance sole.

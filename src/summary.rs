@@ -41,6 +41,9 @@ pub struct ControllerPart {
     pub cycle_time_p99_s: Option<f64>,
     pub cycle_time_p999_s: Option<f64>,
     pub cycle_time_max_s: Option<f64>,
+    /// From the tick to the command sent; the rest of a cycle was prepared ahead.
+    pub feedback_p50_s: Option<f64>,
+    pub feedback_p99_s: Option<f64>,
     pub linearize_p50_s: Option<f64>,
     pub riccati_p50_s: Option<f64>,
     pub qp_p50_s: Option<f64>,
@@ -122,7 +125,7 @@ impl Summary {
 }
 
 /// The keys of the handbook, none of which may ever be missing.
-pub const KEYS: [&str; 44] = [
+pub const KEYS: [&str; 46] = [
     "scenario",
     "seed",
     "success",
@@ -150,6 +153,8 @@ pub const KEYS: [&str; 44] = [
     "cycle_time_p99_s",
     "cycle_time_p999_s",
     "cycle_time_max_s",
+    "feedback_p50_s",
+    "feedback_p99_s",
     "linearize_p50_s",
     "riccati_p50_s",
     "qp_p50_s",
@@ -270,6 +275,7 @@ pub fn table(summary: &Summary, scenario: &Scenario) -> String {
         line("control cycles", Some(part.cycles.to_string()), None);
         let period = Some(format!("period {}", milliseconds(summary.cycle_period_s)));
         line("cycle time, median", part.cycle_time_p50_s.map(milliseconds), period);
+        line("state to command, median", part.feedback_p50_s.map(milliseconds), None);
         line("cycle time, 99.9 %", part.cycle_time_p999_s.map(milliseconds), None);
         line("deadlines missed", Some(part.deadline_misses.to_string()), None);
         line("QP solves", Some(part.qp_solves.to_string()), None);

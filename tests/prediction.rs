@@ -122,7 +122,7 @@ fn first_stage(controller: &RobotController) -> Prediction {
     let length = plan.offsets()[1];
     let n = tree.dof();
     let nodes = [0, 1].map(|k| {
-        let (q, rate) = plan.values.x.col_as_slice(k).split_at(n);
+        let (q, rate) = plan.values.x(k).split_at(n);
         let mut node = NodeKinematics::new(tree);
         node.update(tree, q, rate).unwrap();
         node
@@ -131,7 +131,7 @@ fn first_stage(controller: &RobotController) -> Prediction {
     Prediction {
         begin_ns: ns(plan.start_s),
         end_ns: ns(plan.start_s + length),
-        state: plan.values.x.col_as_slice(1).to_vec(),
+        state: plan.values.x(1).to_vec(),
         wrench: wrench.to_vector().into(),
     }
 }

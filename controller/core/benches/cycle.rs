@@ -1,7 +1,8 @@
 //! Time of one control cycle and of its parts: Atlas, 20 stages over 1 s, all constraints, one core.
 //!
 //! `cargo bench -p delmpc-controller-core --bench cycle`. The robot stands on a welded foot, is pushed, and recovers; cycles with and
-//! without active constraints are counted apart. Medians in µs; times depend on the machine.
+//! without active constraints are counted apart. `riccati` includes the rows that were active before, `total` what was prepared ahead, `feedback` does not. Medians in
+//! µs; times depend on the machine.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 #[path = "../tests/atlas/mod.rs"]
@@ -29,7 +30,7 @@ fn median(values: &mut [f64]) -> f64 {
 
 fn main() {
     println!(
-        "stages  constraints   cycles   state in    shift  linearise   riccati       qp    total (least)   active rows"
+        "stages  constraints   cycles   state in    shift  linearise   riccati       qp   feedback    total (least)   active rows"
     );
     let atlas = atlas();
     for stages in [10, 20, 40] {
@@ -41,7 +42,7 @@ fn main() {
         let mut plant = WeldedPlant::new(&atlas);
         let torso = atlas.rooted.model.link("utorso").unwrap().body.unwrap();
         let clock = Wall(Instant::now());
-        let mut cycles: [Vec<[f64; 7]>; 2] = Default::default();
+        let mut cycles: [Vec<[f64; 8]>; 2] = Default::default();
         for cycle in 0..400 {
             let state = plant.measure();
             let command = *controller.cycle(&state, state.time_ns, &clock);
@@ -52,13 +53,15 @@ fn main() {
                 report.linearize_ns,
                 report.riccati_ns,
                 report.qp_ns,
+                report.total_ns - report.shift_ns - report.linearize_ns - report.riccati_ns,
                 report.total_ns,
             ];
-            let mut row = [0.0; 7];
+            controller.prepare(&clock);
+            let mut row = [0.0; 8];
             for (cell, ns) in row.iter_mut().zip(times) {
                 *cell = ns as f64 * 1e-3;
             }
-            row[6] = f64::from(report.active_rows);
+            row[7] = f64::from(report.active_rows);
             if cycle >= 20 {
                 cycles[usize::from(report.active_rows > 0)].push(row);
             }
@@ -76,11 +79,11 @@ fn main() {
         }
         for (kind, rows) in ["inactive", "active"].iter().zip(&cycles) {
             let mut columns: Vec<Vec<f64>> =
-                (0..7).map(|c| rows.iter().map(|row| row[c]).collect()).collect();
+                (0..8).map(|c| rows.iter().map(|row| row[c]).collect()).collect();
             let m: Vec<f64> = columns.iter_mut().map(|column| median(column)).collect();
-            let least = columns[5].first().copied().unwrap_or(f64::NAN);
+            let least = columns[6].first().copied().unwrap_or(f64::NAN);
             println!(
-                "{stages:6}  {kind:11} {:8} {:10.0} {:8.0} {:10.0} {:9.0} {:8.0} {:8.0} ({least:5.0}) {:10.0}",
+                "{stages:6}  {kind:11} {:8} {:10.0} {:8.0} {:10.0} {:9.0} {:8.0} {:10.0} {:8.0} ({least:5.0}) {:10.0}",
                 rows.len(),
                 m[0],
                 m[1],
@@ -88,7 +91,8 @@ fn main() {
                 m[3],
                 m[4],
                 m[5],
-                m[6]
+                m[6],
+                m[7]
             );
         }
     }

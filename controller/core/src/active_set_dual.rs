@@ -3,7 +3,8 @@
 //! Each row is free (F), at zero (L) or at its upper bound (U). For a partition, `Γ_FF y_F = -(h_F + Γ_FU ρ_U)` by Cholesky;
 //! rows whose `y_F` leaves the box, or whose gradient has the wrong sign, change sides: all at once while their number shrinks,
 //! else (after a few tries) only the last one, Murty's rule, which cannot cycle when `Γ` is positive definite. A relative
-//! `1e-12` on the diagonal makes it so. Warm start: the partition of the previous call is not used, a cycle's rows change.
+//! `1e-12` on the diagonal makes it so. [`QpSolver::solve`] starts cold; [`ActiveSetDual::settle`] starts from the sides that given
+//! multipliers are on, and gives up early.
 //!
 //! If the partition has not settled after the iteration limit, projected coordinate descent takes over: slow, but it never
 //! leaves the box and each sweep improves.
@@ -19,7 +20,7 @@ use alloc::vec::Vec;
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
 use faer::{Mat, MatRef, Par};
 
-use crate::dual_qp::{DualReport, QpSolver, dual_residual};
+use crate::dual_qp::{DualReport, QpSolver, check_data, dual_residual};
 use crate::errors::QpError;
 use crate::kernels::{CholeskyScratch, factor, vector_mut};
 
@@ -52,6 +53,7 @@ pub struct ActiveSetDual {
     solution: Vec<f64>,
     gradient: Vec<f64>,
     scratch: CholeskyScratch,
+    start: Vec<f64>,
 }
 
 impl ActiveSetDual {
@@ -64,6 +66,7 @@ impl ActiveSetDual {
             solution: vec![0.0; capacity],
             gradient: vec![0.0; capacity],
             scratch: CholeskyScratch::new(capacity),
+            start: Vec::with_capacity(capacity),
         }
     }
 
@@ -114,6 +117,78 @@ impl ActiveSetDual {
         Some(())
     }
 
+    /// A few partitions from the sides `y` is on; `None` when they have not settled after `limit`, and `y` is as before.
+    ///
+    /// # Errors
+    /// As [`QpSolver::solve`].
+    pub fn settle(
+        &mut self,
+        gram: MatRef<'_, f64>,
+        slack: &[f64],
+        upper: &[f64],
+        y: &mut [f64],
+        limit: u32,
+    ) -> Result<Option<DualReport>, QpError> {
+        check_data(self.capacity(), gram, slack, upper)?;
+        self.start.clear();
+        self.start.extend_from_slice(y);
+        for (side, (y, upper)) in self.sides.iter_mut().zip(y.iter().zip(upper)) {
+            *side = match *y {
+                y if y <= 0.0 => Side::Zero,
+                y if y >= *upper => Side::Upper,
+                _ => Side::Free,
+            };
+        }
+        let settled = self.pivot(gram, slack, upper, y, limit);
+        if settled.is_none() {
+            y.copy_from_slice(&self.start);
+        }
+        Ok(settled)
+    }
+
+    /// Changes sides until every row is in its place; `None` after `limit` partitions, or when one has no solution.
+    fn pivot(
+        &mut self,
+        gram: MatRef<'_, f64>,
+        slack: &[f64],
+        upper: &[f64],
+        y: &mut [f64],
+        limit: u32,
+    ) -> Option<DualReport> {
+        let rows = slack.len();
+        let tolerance = MISPLACED * (1.0 + crate::kernels::largest(slack));
+        let mut fewest = usize::MAX;
+        let mut patience = PATIENCE;
+        for iterations in 1..=limit {
+            self.solve_partition(gram, slack, upper, y)?;
+            let misplaced = |set: &Self, i: usize, y: &[f64]| set.better_side(i, y, upper, tolerance);
+            let count = (0..rows).filter(|&i| misplaced(self, i, y).is_some()).count();
+            if count == 0 {
+                for (value, limit) in y.iter_mut().zip(upper) {
+                    *value = value.clamp(0.0, limit.max(0.0));
+                }
+                return crate::kernels::all_finite(y).then_some(DualReport { iterations });
+            }
+            let whole_block = if count < fewest {
+                fewest = count;
+                patience = PATIENCE;
+                true
+            } else {
+                patience = patience.saturating_sub(1);
+                patience > 0
+            };
+            for i in (0..rows).rev() {
+                if let Some(side) = misplaced(self, i, y) {
+                    self.sides[i] = side;
+                    if !whole_block {
+                        break;
+                    }
+                }
+            }
+        }
+        None
+    }
+
     /// The side a row should change to, if it is misplaced.
     fn better_side(&self, i: usize, y: &[f64], upper: &[f64], tolerance: f64) -> Option<Side> {
         match self.sides[i] {
@@ -157,48 +232,12 @@ impl QpSolver for ActiveSetDual {
         upper: &[f64],
         y: &mut [f64],
     ) -> Result<DualReport, QpError> {
-        let rows = slack.len();
-        if rows > self.capacity() {
-            return Err(QpError::TooLarge { rows, capacity: self.capacity() });
-        }
-        let finite_gram = (0..rows).all(|j| (0..rows).all(|i| gram[(i, j)].is_finite()));
-        if !finite_gram || !crate::kernels::all_finite(slack) || upper.iter().any(|u| u.is_nan()) {
-            return Err(QpError::NotFinite);
-        }
+        check_data(self.capacity(), gram, slack, upper)?;
         for (side, h) in self.sides.iter_mut().zip(slack) {
             *side = if *h < 0.0 { Side::Free } else { Side::Zero };
         }
-        let tolerance = MISPLACED * (1.0 + crate::kernels::largest(slack));
-        let mut fewest = usize::MAX;
-        let mut patience = PATIENCE;
-        for iteration in 1..=MAX_PARTITIONS {
-            if self.solve_partition(gram, slack, upper, y).is_none() {
-                break;
-            }
-            let misplaced = |set: &Self, i: usize, y: &[f64]| set.better_side(i, y, upper, tolerance);
-            let count = (0..rows).filter(|&i| misplaced(self, i, y).is_some()).count();
-            if count == 0 {
-                for (value, limit) in y.iter_mut().zip(upper) {
-                    *value = value.clamp(0.0, limit.max(0.0));
-                }
-                return finish(y, iteration);
-            }
-            let whole_block = if count < fewest {
-                fewest = count;
-                patience = PATIENCE;
-                true
-            } else {
-                patience = patience.saturating_sub(1);
-                patience > 0
-            };
-            for i in (0..rows).rev() {
-                if let Some(side) = misplaced(self, i, y) {
-                    self.sides[i] = side;
-                    if !whole_block {
-                        break;
-                    }
-                }
-            }
+        if let Some(report) = self.pivot(gram, slack, upper, y, MAX_PARTITIONS) {
+            return Ok(report);
         }
         for (value, limit) in y.iter_mut().zip(upper) {
             *value = if value.is_finite() { value.clamp(0.0, limit.max(0.0)) } else { 0.0 };

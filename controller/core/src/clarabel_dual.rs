@@ -24,7 +24,7 @@ use clarabel::solver::{
 };
 use faer::MatRef;
 
-use crate::dual_qp::{DualReport, QpSolver};
+use crate::dual_qp::{DualReport, QpSolver, check_data};
 use crate::errors::QpError;
 
 /// The smallest solver.
@@ -202,10 +202,7 @@ impl QpSolver for ClarabelDual {
         y: &mut [f64],
     ) -> Result<DualReport, QpError> {
         let (rows, capacity) = (slack.len(), self.capacity());
-        let finite_gram = (0..rows).all(|j| (0..rows).all(|i| gram[(i, j)].is_finite()));
-        if !finite_gram || !crate::kernels::all_finite(slack) || upper.iter().any(|u| u.is_nan()) {
-            return Err(QpError::NotFinite);
-        }
+        check_data(capacity, gram, slack, upper)?;
         match self.solvers.iter_mut().find(|solver| solver.rows >= rows) {
             Some(solver) => solver.solve(gram, slack, upper, y),
             None => Err(QpError::TooLarge { rows, capacity }),

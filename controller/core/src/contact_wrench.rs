@@ -30,12 +30,12 @@ use alloc::vec::Vec;
 use delmpc_mechanics::spatial::Wrench;
 use delmpc_mechanics::tree::KinematicTree;
 use delmpc_messages::ConstraintKind;
-use faer::{Accum, Mat};
+use nalgebra::Vector3;
 
 use crate::errors::ControlError;
-use crate::kernels::{gemm, gemv};
-use crate::lq_problem::{LqStage, RowTag};
+use crate::lq_problem::{LqStage, OutputRow, RowTag};
 use crate::node_kinematics::NodeKinematics;
+use crate::panel::Panel;
 
 /// What a flat foot can transmit.
 #[derive(Clone, Debug, PartialEq)]
@@ -69,8 +69,6 @@ pub struct ConeRow {
 #[derive(Clone, Debug)]
 pub struct WrenchCone {
     rows: Vec<ConeRow>,
-    /// The coefficients of all rows, one row a column.
-    coefficients: Mat<f64>,
 }
 
 impl WrenchCone {
@@ -144,98 +142,91 @@ impl WrenchCone {
                 tag: moment(ConstraintKind::YawTorque, i),
             });
         }
-        let coefficients = Mat::from_fn(6, rows.len(), |i, row| rows[row].coefficients[i]);
-        Ok(Self { rows, coefficients })
+        Ok(Self { rows })
     }
 
     /// The rows.
     pub fn rows(&self) -> &[ConeRow] {
         &self.rows
     }
+
+    /// The rows on the outputs of a stage, of which the wrench is the first six.
+    pub fn output_rows(&self) -> impl Iterator<Item = OutputRow> + '_ {
+        self.rows.iter().map(|row| OutputRow {
+            coefficients: row.coefficients.to_vec(),
+            bound: row.bound,
+            tag: row.tag,
+        })
+    }
 }
 
-/// The wrench of a stage as an affine map of `z = (u, x)`.
+/// Components of a wrench.
+const COMPONENTS: usize = 6;
+
+/// The wrench of a stage as an affine map of `z = (u, x)`: its outputs.
 #[derive(Clone, Debug)]
 pub struct StageWrench {
-    value: [f64; 6],
-    map: Mat<f64>,
-    at_end: Mat<f64>,
+    /// By the state at the end: one state a column.
+    at_end: Panel,
 }
 
 impl StageWrench {
     /// For `n` joints, which are also the inputs.
     pub fn new(n: usize) -> Self {
-        Self { value: [0.0; 6], map: Mat::zeros(6, 3 * n), at_end: Mat::zeros(6, 2 * n) }
+        Self { at_end: Panel::zeros(COMPONENTS, 2 * n) }
     }
 
-    /// Linearises the mean wrench of a stage of `time_step` (s) from the node `start` to the node `end`, whose transition and
-    /// defect are in `stage`.
+    /// Linearises the mean wrench of a stage of `time_step` (s) from the node `start` to the node `end`, and writes it, torque
+    /// first, to the first six outputs of `stage`, whose transition and defect it needs.
     pub fn linearize(
         &mut self,
         tree: &KinematicTree,
         start: &NodeKinematics,
         end: &NodeKinematics,
         time_step: f64,
-        stage: &LqStage,
+        stage: &mut LqStage,
     ) {
         let n = tree.dof();
-        self.value = mean_wrench(tree, start, end, time_step).to_vector().into();
-        let g = *tree.gravity_w();
-        let mass = tree.total_mass();
-        let twelfth = time_step / 12.0;
+        let weight = tree.gravity_w() * tree.total_mass();
         for j in 0..n {
-            // Mean of the mass centre: by q half the mass centre, by velocity a twelfth of the step.
-            let both = |node: &NodeKinematics, sign: f64| {
-                let d_com = node.d_com_d_q(j) * 0.5 - node.d_com_velocity_d_q(j) * (sign * twelfth);
-                let d_com_rate = node.d_com_d_q(j) * (-sign * twelfth);
-                let momentum = |d: Wrench, d_mean: nalgebra::Vector3<f64>| {
-                    let mut d = d * (sign / time_step);
-                    d.torque -= d_mean.cross(&g) * mass;
-                    d.to_vector()
-                };
-                (momentum(node.d_momentum_d_q(j), d_com), momentum(node.d_momentum_d_rate(j), d_com_rate))
-            };
-            let (end_q, end_rate) = both(end, 1.0);
-            let (start_q, start_rate) = both(start, -1.0);
-            for row in 0..6 {
-                self.at_end[(row, j)] = end_q[row];
-                self.at_end[(row, n + j)] = end_rate[row];
-                self.map[(row, n + j)] = start_q[row];
-                self.map[(row, 2 * n + j)] = start_rate[row];
+            let (by_q, by_rate) = derivative(&weight, end, j, time_step, 1.0);
+            self.at_end.column_mut(j)[..COMPONENTS].copy_from_slice(&by_q);
+            self.at_end.column_mut(n + j)[..COMPONENTS].copy_from_slice(&by_rate);
+        }
+        stage.set_outputs_through_transition(&self.at_end);
+        for j in 0..n {
+            let (by_q, by_rate) = derivative(&weight, start, j, time_step, -1.0);
+            for row in 0..COMPONENTS {
+                let output = stage.output_mut(row);
+                output.by_state[j] += by_q[row];
+                output.by_state[n + j] += by_rate[row];
             }
         }
-        self.map.as_mut().subcols_mut(0, n).fill(0.0);
-        gemm(self.map.as_mut(), Accum::Add, self.at_end.as_ref(), stage.transition.as_ref(), 1.0);
-        gemv(&mut self.value, Accum::Add, self.at_end.as_ref(), &stage.defect, 1.0);
-    }
-
-    /// `W_0`, torque first.
-    pub fn value(&self) -> &[f64; 6] {
-        &self.value
-    }
-
-    /// `W_z`, `6 x 3n`, columns `(u, q, q̇)`.
-    pub fn map(&self) -> &Mat<f64> {
-        &self.map
-    }
-
-    /// Writes the cone's rows into the stage, from row `first` on, with soft penalties. Rows that do not fit are left out.
-    pub fn write_rows(&self, cone: &WrenchCone, stage: &mut LqStage) {
-        stage.row_count = cone.rows.len().min(stage.row_bound.len());
-        let count = stage.row_count;
-        gemm(
-            stage.rows.as_mut().subcols_mut(0, count),
-            Accum::Replace,
-            self.map.as_ref().transpose(),
-            cone.coefficients.as_ref().subcols(0, count),
-            1.0,
-        );
-        for (i, row) in cone.rows.iter().enumerate().take(count) {
-            let value: f64 = row.coefficients.iter().zip(&self.value).map(|(c, w)| c * w).sum();
-            stage.row_bound[i] = row.bound - value;
-            stage.row_tag[i] = row.tag;
+        let mean = mean_wrench(tree, start, end, time_step).to_vector();
+        for (row, mean) in mean.iter().enumerate() {
+            *stage.output_mut(row).value += mean;
         }
     }
+}
+
+/// `∂W/∂q_j` and `∂W/∂q̇_j` of a node, with the other one held; `weight` in N, `sign` 1 for the end of the stage, -1 for its start.
+fn derivative(
+    weight: &Vector3<f64>,
+    node: &NodeKinematics,
+    joint: usize,
+    time_step: f64,
+    sign: f64,
+) -> ([f64; COMPONENTS], [f64; COMPONENTS]) {
+    let twelfth = sign * time_step / 12.0;
+    // Mean of the mass centre: by q half the mass centre, by velocity a twelfth of the step.
+    let d_com = node.d_com_d_q(joint) * 0.5 - node.d_com_velocity_d_q(joint) * twelfth;
+    let d_com_rate = node.d_com_d_q(joint) * -twelfth;
+    let wrench = |d: Wrench, d_mean: Vector3<f64>| {
+        let (mut torque, force) = (d.torque * (sign / time_step), d.force * (sign / time_step));
+        torque -= d_mean.cross(weight);
+        [torque.x, torque.y, torque.z, force.x, force.y, force.z]
+    };
+    (wrench(node.d_momentum_d_q(joint), d_com), wrench(node.d_momentum_d_rate(joint), d_com_rate))
 }
 
 /// The mean wrench of the ground on the robot over a stage between two nodes, about the origin of {0}.

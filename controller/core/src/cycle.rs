@@ -1,8 +1,13 @@
 //! One control cycle: state in, command out, always.
 //!
 //! ```text
-//! take the state in -> shift the nominal -> linearise every stage -> Riccati -> constrained QP -> command
+//! prepare    shift the nominal -> linearise every stage -> Riccati -> rows that were active
+//! feed back  take the state in -> constrained QP -> command
 //! ```
+//!
+//! Nothing of the preparation needs the measurement: the nominal is the last plan, and the measured state enters as the first
+//! deviation. So [`Controller::prepare`] may be called while the next state is waited for, and [`Controller::cycle`] is then the
+//! short rest; without it the cycle does both.
 //!
 //! Whatever fails, a command goes out: from the best rung of the ladder ([`crate::fallback`]) that can be formed, and the report
 //! says what happened. Time is an argument; figures of time come from a [`Clock`] of the caller.
@@ -16,31 +21,31 @@ use alloc::vec::Vec;
 
 use delmpc_mechanics::inverse_dynamics::{InverseDynamicsWorkspace, gravity_force_into};
 use delmpc_messages::{Command, CycleReport, FallbackLevel, LARGEST_EFFORT, PlantState, Verdict};
-use faer::{Mat, MatRef};
+use faer::MatRef;
 use nalgebra::Vector3;
 
 use crate::config::{ControllerConfig, ControllerKind};
-use crate::contact_wrench::{FlatFoot, StageWrench, WrenchCone};
-use crate::dare::solve_dare;
+use crate::contact_wrench::{FlatFoot, WrenchCone};
 use crate::dual_qp::QpSolver;
 use crate::errors::ControlError;
 use crate::estimator::{Estimate, Estimator};
 use crate::fallback::{Attempt, FallbackLadder, Situation};
 use crate::feedback_law::{Law, bound_by_pressure_point, write_law};
-use crate::horizon_dynamics::HorizonDynamics;
-use crate::kernels::{all_finite, gemv};
-use crate::lq_problem::{LqProblem, LqSize, LqStage};
+use crate::horizon_problem::HorizonProblem;
+use crate::kernels::all_finite;
+use crate::lq_problem::LqProblem;
 use crate::model::ControllerModel;
 use crate::node_kinematics::NodeKinematics;
 use crate::plan::Plan;
 use crate::posture_goal::{posture_goal, reach_posture};
 use crate::projected_qp::{ProjectedQp, ProjectedQpReport, default_backend};
 use crate::reference::{Reach, Reference};
-use crate::riccati::{Riccati, Trajectory};
+use crate::riccati::Riccati;
 use crate::stage_dynamics::StageDynamics;
 use crate::stop_watch::StopWatch;
 pub use crate::stop_watch::{Clock, StoppedClock};
-use crate::tasks::{TaskTargets, Tasks};
+use crate::tasks::TaskTargets;
+use crate::trajectory::Trajectory;
 
 /// Reasons for refusing a state that are the controller's own ([`Command::reason`]); below 100 they are the message's.
 pub mod reason {
@@ -70,6 +75,8 @@ const LARGEST_MOVE: f64 = 2.0;
 const MISMATCH_CYCLES: u32 = 5;
 /// Part of effort over velocity limit that damps a joint on the last rungs.
 const DAMPING_FRACTION: f64 = 0.1;
+/// Part of a new difference between planned and measured force that counts at once.
+const FORCE_SMOOTHING: f64 = 0.5;
 /// Distance of any joint from the home posture up to which the static LQR is trusted, rad or m.
 const LQR_REACH: f64 = 0.6;
 
@@ -78,23 +85,17 @@ const LQR_REACH: f64 = 0.6;
 pub struct Controller {
     model: ControllerModel,
     config: ControllerConfig,
-    lengths: Vec<f64>,
 
     estimator: Estimator,
     ladder: FallbackLadder,
     reference: Reference,
     targets: TaskTargets,
-    tasks: Tasks,
-    torque_weight: Vec<f64>,
-    cone: Option<WrenchCone>,
 
     dynamics: StageDynamics,
-    horizon: HorizonDynamics,
-    nodes: Vec<NodeKinematics>,
     gravity: InverseDynamicsWorkspace,
-    wrench: StageWrench,
+    node: NodeKinematics,
 
-    problem: LqProblem,
+    horizon: HorizonProblem,
     riccati: Riccati,
     qp: ProjectedQp,
     backend: Box<dyn QpSolver + Send>,
@@ -103,6 +104,10 @@ pub struct Controller {
     plan: Plan,
     nominal: Plan,
     has_plan: bool,
+    /// Whether `nominal`, `horizon` and `riccati` are those of a solution to come, and what that took.
+    prepared: Option<Preparation>,
+    /// Time of the first node the present factors belong to, s of the run.
+    factors_start_s: f64,
 
     /// State predicted for the time of the command.
     predicted: Vec<f64>,
@@ -111,9 +116,12 @@ pub struct Controller {
     surprising_cycles: u32,
     innovation_rate: f64,
     scratch: Vec<f64>,
+    /// Force on the stance foot in the first stage of the last plan, N.
+    planned_force: Option<Vector3<f64>>,
+    /// By how much the measured one differs, N.
+    force_change: Vector3<f64>,
 
     static_law: Law,
-    terminal_cost: Mat<f64>,
     /// The law in the last command.
     law: Law,
     command: Command,
@@ -122,6 +130,14 @@ pub struct Controller {
     origin_ns: Option<u64>,
     last_state_ns: Option<u64>,
     last_sequence: u64,
+}
+
+/// Times of a finished preparation, ns.
+#[derive(Clone, Copy, Debug)]
+struct Preparation {
+    shift_ns: u64,
+    linearize_ns: u64,
+    riccati_ns: u64,
 }
 
 impl Controller {
@@ -134,7 +150,6 @@ impl Controller {
         config.check()?;
         let tree = &model.tree;
         let n = tree.dof();
-        let lengths = config.stage_lengths();
         let cone = if model.sole.is_empty() {
             None
         } else {
@@ -150,44 +165,23 @@ impl Controller {
             };
             Some(WrenchCone::flat_foot(&foot, weight, c.contact_penalty)?)
         };
-        let rows = cone.as_ref().map_or(0, |cone| cone.rows().len());
-        let size = LqSize { states: 2 * n, inputs: n, stages: lengths.len(), rows };
-        let mut problem = LqProblem::new(size);
-        for j in 0..n {
-            problem.input_tags[j].scale = model.limits[j].effort.min(1e9);
-            problem.state_tags[j].penalty = config.constraints.position_penalty;
-            problem.state_tags[n + j].penalty = config.constraints.velocity_penalty;
-            problem.state_tags[n + j].scale = model.limits[j].velocity.min(1e9);
-        }
+        let horizon = HorizonProblem::new(&model, &config, cone.as_ref())?;
+        let size = horizon.problem.size();
         let home = posture_goal(&model, &model.posture)?;
         let backend = default_backend(config.qp.capacity)
             .map_err(|_| ControlError::Model { reason: "the QP solver refused its set-up" })?;
-        let torque_weight = model
-            .limits
-            .iter()
-            .map(|limit| {
-                // Without a limit, 100 N·m stands for one.
-                let effort = if limit.effort.is_finite() { limit.effort } else { 100.0 };
-                config.weights.torque / (effort * effort)
-            })
-            .collect();
         let mut command = Command::new(0, model.joint_set_hash, n as u32);
         command.fallback_level = FallbackLevel::ZeroTorque as u32;
-        let plan = Plan::new(Trajectory::new(size), &lengths);
+        let plan = Plan::new(Trajectory::new(size), &config.stage_lengths());
         let mut controller = Self {
             estimator: Estimator::new(&model),
             ladder: FallbackLadder::new(config.fallback),
             reference: Reference { home, reach: None },
             targets: TaskTargets::new(n),
-            tasks: Tasks::new(n, config.weights.clone(), model.hand, model.swing_foot),
-            torque_weight,
-            cone,
             dynamics: StageDynamics::new(tree)?,
-            horizon: HorizonDynamics::new(tree, lengths.len())?,
-            nodes: vec![NodeKinematics::new(tree); lengths.len() + 1],
             gravity: InverseDynamicsWorkspace::new(tree),
-            wrench: StageWrench::new(n),
-            problem,
+            node: NodeKinematics::new(tree),
+            horizon,
             riccati: Riccati::new(size),
             qp: ProjectedQp::new(size, config.qp),
             backend,
@@ -195,21 +189,23 @@ impl Controller {
             nominal: plan.clone(),
             plan,
             has_plan: false,
+            prepared: None,
+            factors_start_s: 0.0,
             predicted: vec![0.0; 2 * n],
             predicted_for_s: 0.0,
             has_prediction: false,
             surprising_cycles: 0,
             innovation_rate: 0.0,
             scratch: vec![0.0; 4 * n],
+            planned_force: None,
+            force_change: Vector3::zeros(),
             static_law: Law::new(n),
-            terminal_cost: Mat::zeros(2 * n, 2 * n),
             law: Law::new(n),
             blank_report: command.report,
             command,
             origin_ns: None,
             last_state_ns: None,
             last_sequence: 0,
-            lengths,
             model,
             config,
         };
@@ -247,7 +243,7 @@ impl Controller {
         let level = self.ladder.advance(&situation);
         self.write_command(level, state, now_ns);
 
-        let total_ns = clock.now_ns().saturating_sub(begin);
+        let total_ns = self.command.report.total_ns + clock.now_ns().saturating_sub(begin);
         self.command.report.total_ns = total_ns;
         let late = total_ns as f64 * 1e-9 > self.config.budget_s;
         if late && self.command.verdict == Verdict::Ok as u32 {
@@ -264,20 +260,51 @@ impl Controller {
         if self.config.kind != ControllerKind::Mpc {
             return Ok(());
         }
-        self.shift_nominal(start_s);
-        self.command.report.shift_ns = watch.lap();
-        let linearised = self.linearise_stages();
-        self.command.report.linearize_ns = watch.lap();
-        linearised?;
-        let factorised = self.riccati.factorise(&self.problem);
-        self.command.report.riccati_ns = watch.lap();
-        factorised.map_err(|_| reason::RICCATI)?;
+        let prepared = match self.prepared.take() {
+            Some(ahead) if start_s == self.nominal.start_s => {
+                // Counts too: the machine has to do it once a period.
+                self.command.report.total_ns = ahead.shift_ns + ahead.linearize_ns + ahead.riccati_ns;
+                ahead
+            }
+            _ => self.prepare_for(start_s, &mut watch)?,
+        };
+        self.command.report.shift_ns = prepared.shift_ns;
+        self.command.report.linearize_ns = prepared.linearize_ns;
+        self.command.report.riccati_ns = prepared.riccati_ns;
         let solved = self.solve_constrained();
         self.command.report.qp_ns = watch.lap();
         let report = solved?;
         self.adopt_plan()?;
         self.report_constraints(&report);
         Ok(())
+    }
+
+    /// Makes ready for the next measurement, one period after the last: all that does not need it. To be called while waiting.
+    ///
+    /// Does nothing before the first good cycle. If it fails, or the measurement is of another time, the next cycle does the work.
+    pub fn prepare(&mut self, clock: &dyn Clock) {
+        self.prepared = None;
+        if self.config.kind != ControllerKind::Mpc || !self.has_plan {
+            return;
+        }
+        let Some(last_ns) = self.last_state_ns else { return };
+        let next_ns = last_ns + to_ns(self.config.period_s);
+        let start_s = self.run_time_s(next_ns) + self.config.delay_s;
+        self.prepared = self.prepare_for(start_s, &mut StopWatch::start(clock)).ok();
+    }
+
+    /// Nominal, linearisation, factors and warm rows of the problem that begins at `start_s`.
+    fn prepare_for(&mut self, start_s: f64, watch: &mut StopWatch<'_>) -> Result<Preparation, u32> {
+        self.shift_nominal(start_s);
+        let shift_ns = watch.lap();
+        self.horizon
+            .linearise(&self.model, &self.config, &self.reference, &self.nominal)
+            .map_err(|_| reason::STAGE)?;
+        let linearize_ns = watch.lap();
+        self.factors_start_s = start_s;
+        self.riccati.factorise(&self.horizon.problem).map_err(|_| reason::RICCATI)?;
+        self.qp.prepare(&self.horizon.problem, &self.riccati);
+        Ok(Preparation { shift_ns, linearize_ns, riccati_ns: watch.lap() })
     }
 
     /// Validates and converts the measurement, and predicts the state at which the command takes effect; returns that time.
@@ -295,12 +322,23 @@ impl Controller {
         self.last_state_ns = Some(state.time_ns);
         self.last_sequence = state.header.sequence;
 
+        let measured = Vector3::from(state.stance_force_b);
+        let change = self.planned_force.map_or(Vector3::zeros(), |planned| measured - planned);
+        self.force_change += FORCE_SMOOTHING * (change - self.force_change);
+
         let measured_s = self.run_time_s(state.time_ns);
         self.test_innovation(measured_s);
         let Estimate { q, q_dot, .. } = self.estimator.estimate();
         self.predicted[..n].copy_from_slice(q);
         self.predicted[n..].copy_from_slice(q_dot);
-        let start_s = (measured_s + self.config.delay_s).max(self.run_time_s(now_ns));
+        let mut start_s = (measured_s + self.config.delay_s).max(self.run_time_s(now_ns));
+        let ahead_s = self.nominal.start_s;
+        if self.prepared.is_some()
+            && ahead_s >= measured_s
+            && (ahead_s - start_s).abs() <= self.config.servo_period_s
+        {
+            start_s = ahead_s;
+        }
         self.predict(start_s - measured_s).map_err(|()| reason::PREDICTION)?;
         self.predicted_for_s = start_s;
         self.has_prediction = true;
@@ -317,13 +355,12 @@ impl Controller {
         let time_step = duration_s / steps;
         let (error, rest) = self.scratch.split_at_mut(2 * n);
         let (torque, _) = rest.split_at_mut(n);
-        let mut elapsed_s = 0.0;
-        for _ in 0..steps as usize {
-            self.law.torque_at(elapsed_s, &self.predicted, error, torque);
-            elapsed_s += time_step;
-            let tree = &self.model.tree;
-            self.dynamics.simulate(tree, &self.predicted, torque, time_step, error).map_err(|_| ())?;
-            self.predicted.copy_from_slice(error);
+        let tree = &self.model.tree;
+        self.dynamics.set_time_step(time_step).map_err(|_| ())?;
+        self.dynamics.begin(tree, &self.predicted).map_err(|_| ())?;
+        for step in 0..steps as usize {
+            self.law.torque_at(step as f64 * time_step, &self.predicted, error, torque);
+            self.dynamics.advance(tree, torque, &mut self.predicted).map_err(|_| ())?;
         }
         if all_finite(&self.predicted) { Ok(()) } else { Err(()) }
     }
@@ -358,92 +395,36 @@ impl Controller {
         }
         let n = self.model.tree.dof();
         self.nominal.start_s = start_s;
-        for k in 0..=self.lengths.len() {
+        for k in 0..=self.nominal.values.stages() {
             self.reference.sample(start_s + self.nominal.offsets()[k], &mut self.targets);
-            let x = self.nominal.values.x.col_as_slice_mut(k);
+            let x = self.nominal.values.x_mut(k);
             x[..n].copy_from_slice(&self.targets.posture);
             x[n..].copy_from_slice(&self.targets.posture_rate);
-            if k < self.lengths.len() {
-                let u = self.nominal.values.u.col_as_slice_mut(k);
+            if k < self.nominal.values.stages() {
+                let u = self.nominal.values.u_mut(k);
                 u.copy_from_slice(&self.static_law.torque);
             }
         }
     }
 
-    /// Fills the LQ problem around the nominal.
-    fn linearise_stages(&mut self) -> Result<(), u32> {
-        let tree = &self.model.tree;
-        let n = tree.dof();
-        let stages = self.lengths.len();
-        let Trajectory { x: nodes, u: inputs } = &self.nominal.values;
-        self.horizon
-            .linearise(nodes.as_ref(), inputs.as_ref(), &self.lengths, &mut self.problem.stages)
-            .map_err(|_| reason::STAGE)?;
-        for (k, node) in self.nodes.iter_mut().enumerate() {
-            node.take(self.horizon.batch(), k);
-        }
-        for k in 0..stages {
-            let (x, u) = (nodes.col_as_slice(k), inputs.col_as_slice(k));
-            let stage = &mut self.problem.stages[k];
-            let duration = self.lengths[k];
-
-            self.reference.sample(self.nominal.start_s + self.nominal.offsets()[k], &mut self.targets);
-            stage.hessian.fill(0.0);
-            stage.gradient.fill(0.0);
-            for (j, u) in u.iter().enumerate() {
-                let weight = self.torque_weight[j] * duration;
-                stage.hessian[(j, j)] = weight;
-                stage.gradient[j] = weight * (u - self.horizon.batch().gravity_force(k, j));
-            }
-            let hessian = stage.hessian.as_mut().submatrix_mut(n, n, 2 * n, 2 * n);
-            let gradient = &mut stage.gradient[n..];
-            let node = &self.nodes[k];
-            self.tasks.quadratise(tree, node, x.split_at(n), &self.targets, duration, (hessian, gradient));
-
-            bound_inputs(&self.model, self.config.constraints.torque_fraction, u, stage);
-            bound_state(&self.model, x, &mut stage.state);
-            if let Some(cone) = &self.cone {
-                self.wrench.linearize(tree, node, &self.nodes[k + 1], duration, stage);
-                self.wrench.write_rows(cone, stage);
-            }
-        }
-        self.terminal(stages);
-        Ok(())
-    }
-
-    /// Cost and bounds of the last node.
-    fn terminal(&mut self, stages: usize) {
-        let n = self.model.tree.dof();
-        let x = self.nominal.values.x.col_as_slice(stages);
-        self.reference.sample(self.nominal.start_s + self.nominal.horizon_s(), &mut self.targets);
-        let error = &mut self.scratch[..2 * n];
-        for j in 0..n {
-            error[j] = x[j] - self.targets.posture[j];
-            error[n + j] = x[n + j] - self.targets.posture_rate[j];
-        }
-        self.problem.terminal_hessian.copy_from(&self.terminal_cost);
-        let gradient = &mut self.problem.terminal_gradient;
-        gemv(gradient, faer::Accum::Replace, self.terminal_cost.as_ref(), error, 1.0);
-        bound_state(&self.model, x, &mut self.problem.terminal_state);
-    }
-
     fn solve_constrained(&mut self) -> Result<ProjectedQpReport, u32> {
-        let first = self.solution.x.col_as_slice_mut(0);
-        for ((d, x), node) in first.iter_mut().zip(&self.predicted).zip(self.nominal.values.x.col_as_slice(0))
-        {
+        let deviations = self.predicted.iter().zip(self.nominal.values.x(0));
+        for (d, (x, node)) in self.solution.x_mut(0).iter_mut().zip(deviations) {
             *d = x - node;
         }
-        let solved = self.qp.solve(&self.problem, &self.riccati, self.backend.as_mut(), &mut self.solution);
+        let problem = &self.horizon.problem;
+        let solved = self.qp.solve(problem, &self.riccati, self.backend.as_mut(), &mut self.solution);
         solved.map_err(|_| reason::QP)
     }
 
     /// The solution becomes the plan, unless it is out of reach of the linearisation.
     fn adopt_plan(&mut self) -> Result<(), u32> {
         let n = self.model.tree.dof();
-        let largest = |k: usize| crate::kernels::largest(&self.solution.x.col_as_slice(k)[..n]);
-        if (0..=self.lengths.len()).any(|k| largest(k) > LARGEST_MOVE) {
+        let largest = |k: usize| crate::kernels::largest(&self.solution.x(k)[..n]);
+        if (0..=self.solution.stages()).any(|k| largest(k) > LARGEST_MOVE) {
             return Err(reason::FAR);
         }
+        self.planned_force = self.horizon.force(0, &self.solution);
         self.nominal.add(&self.solution);
         core::mem::swap(&mut self.plan, &mut self.nominal);
         self.has_plan = true;
@@ -524,7 +505,7 @@ impl Controller {
         match effective {
             FallbackLevel::FreshSolution | FallbackLevel::ShiftedPlan => {
                 let stage = self.plan.stage_at(time_s);
-                law.torque.copy_from_slice(self.plan.values.u.col_as_slice(stage));
+                law.torque.copy_from_slice(self.plan.values.u(stage));
                 // The law holds for a period, over which its reference goes from the plan's rates to the plan's rates.
                 let period_s = self.config.period_s;
                 self.plan.state_at(time_s + period_s, &mut self.scratch[..2 * n]);
@@ -532,10 +513,11 @@ impl Controller {
                 for j in 0..n {
                     law.acceleration[j] = (self.scratch[n + j] - law.reference[n + j]) / period_s;
                 }
-                law.gain.copy_from(self.riccati.gain(stage));
+                // The factors may be those of a later start already.
+                let factors_stage = self.plan.stage_after(time_s - self.factors_start_s);
+                law.gain.copy_from(self.riccati.gain(factors_stage));
                 if level == FallbackLevel::FreshSolution {
-                    let planned = (self.solution.u.as_ref(), self.solution.x.as_ref());
-                    bound_by_pressure_point(&self.problem.stages[stage], stage, planned, law);
+                    bound_by_pressure_point(&self.horizon, stage, &self.solution, &self.force_change, law);
                 }
             }
             FallbackLevel::StaticLqr => {
@@ -557,7 +539,7 @@ impl Controller {
                 }
                 if effective == FallbackLevel::GravityHold {
                     self.scratch[..n].fill(0.0);
-                    let node = &mut self.nodes[0];
+                    let node = &mut self.node;
                     let held = node.update(&self.model.tree, q, &self.scratch[..n]).and_then(|()| {
                         let kinematics = node.kinematics();
                         gravity_force_into(&self.model.tree, kinematics, &mut self.gravity, &mut law.torque)
@@ -579,30 +561,16 @@ impl Controller {
         let n = tree.dof();
         let mut x = vec![0.0; 2 * n];
         x[..n].copy_from_slice(&self.model.posture);
-        self.nodes[0].update(tree, &x[..n], &x[n..])?;
+        self.node.update(tree, &x[..n], &x[n..])?;
         let mut torque = vec![0.0; n];
-        gravity_force_into(tree, self.nodes[0].kinematics(), &mut self.gravity, &mut torque)?;
-        self.reference.sample(f64::NEG_INFINITY, &mut self.targets);
-
-        let last = self.lengths.last().copied().unwrap_or(self.config.period_s);
-        for (index, duration) in [last, self.config.period_s].into_iter().enumerate() {
-            let mut stage = LqProblem::new(LqSize { states: 2 * n, inputs: n, stages: 1, rows: 0 });
-            let stage = &mut stage.stages[0];
-            self.dynamics.linearise(tree, &x, &torque, duration, &x, stage)?;
-            for j in 0..n {
-                stage.hessian[(j, j)] = self.torque_weight[j] * duration;
-            }
-            let hessian = stage.hessian.as_mut().submatrix_mut(n, n, 2 * n, 2 * n);
-            let gradient = &mut stage.gradient[n..];
-            let node = &self.nodes[0];
-            self.tasks.quadratise(tree, node, x.split_at(n), &self.targets, duration, (hessian, gradient));
-            let solution = solve_dare(stage.transition.as_ref(), stage.hessian.as_ref(), n)?;
-            if index == 0 {
-                self.terminal_cost.copy_from(&solution.cost_to_go);
-            } else {
-                self.static_law.gain.copy_from(&solution.gain);
-            }
-        }
+        gravity_force_into(tree, self.node.kinematics(), &mut self.gravity, &mut torque)?;
+        let last = self.config.stage_lengths().last().copied().unwrap_or(self.config.period_s);
+        let mut stand_still = |duration| {
+            self.horizon.stand_still(tree, &mut self.dynamics, &self.reference, (&x, &torque), duration)
+        };
+        let (coarse, fine) = (stand_still(last)?, stand_still(self.config.period_s)?);
+        self.horizon.set_terminal_cost(&coarse.cost_to_go);
+        self.static_law.gain.copy_from(&fine.gain);
         self.static_law.torque.copy_from_slice(&torque);
         self.static_law.reference.copy_from_slice(&x);
         Ok(())
@@ -648,7 +616,7 @@ impl Controller {
 
     /// The LQ problem of the last cycle.
     pub fn problem(&self) -> &LqProblem {
-        &self.problem
+        &self.horizon.problem
     }
 
     /// State `(q, q̇)` predicted for the time the last command takes effect.
@@ -685,25 +653,6 @@ const LEVELS: [FallbackLevel; 6] = [
     FallbackLevel::DampingOnly,
     FallbackLevel::ZeroTorque,
 ];
-
-/// Torque limits as bounds on the deviation from the nominal torque.
-fn bound_inputs(model: &ControllerModel, fraction: f64, nominal: &[f64], stage: &mut LqStage) {
-    for (j, limit) in model.limits.iter().enumerate() {
-        stage.input.upper[j] = fraction * limit.effort - nominal[j];
-        stage.input.lower[j] = -fraction * limit.effort - nominal[j];
-    }
-}
-
-/// Position and velocity limits as bounds on the deviation from a nominal state.
-fn bound_state(model: &ControllerModel, nominal: &[f64], bounds: &mut crate::lq_problem::BoxBounds) {
-    let n = model.limits.len();
-    for (j, limit) in model.limits.iter().enumerate() {
-        bounds.lower[j] = limit.lower - nominal[j];
-        bounds.upper[j] = limit.upper - nominal[j];
-        bounds.lower[n + j] = -limit.velocity - nominal[n + j];
-        bounds.upper[n + j] = limit.velocity - nominal[n + j];
-    }
-}
 
 fn to_ns(seconds: f64) -> u64 {
     libm::round(seconds * 1e9) as u64

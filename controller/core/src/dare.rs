@@ -1,9 +1,9 @@
 //! The infinite-horizon Riccati equation by structure-preserving doubling: the terminal cost.
 //!
-//! `P = Q + A'PA - (S + B'PA)' (R + B'PB)⁻¹ (S + B'PA)`. With `u = v - R⁻¹S x` the cross term disappears; then
+//! `P = Q + A'PA - A'PB (R + B'PB)⁻¹ B'PA`, with a diagonal `R`:
 //!
 //! ```text
-//! A_0 = A - B R⁻¹ S      G_0 = B R⁻¹ B'      H_0 = Q - S' R⁻¹ S      W = 1 + G H
+//! A_0 = A      G_0 = B R⁻¹ B'      H_0 = Q      W = 1 + G H
 //! A⁺ = A W⁻¹ A           G⁺ = G + A W⁻¹ G A'           H⁺ = H + A' H W⁻¹ A           H -> P
 //! ```
 //!
@@ -16,11 +16,12 @@
 use alloc::vec;
 
 use faer::linalg::solvers::{PartialPivLu, Solve};
-use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
-use faer::{Accum, Mat, MatRef, Par};
+use faer::{Accum, Mat, MatRef};
 
 use crate::errors::ControlError;
-use crate::kernels::{CholeskyScratch, factor, gemm, gemm_lower, mirror_lower};
+use crate::kernels::gemm;
+use crate::lq_problem::{LqProblem, LqSize, LqStage};
+use crate::riccati::Riccati;
 
 /// Doublings after which there is no solution to be expected: 2^60 stages.
 const MAX_DOUBLINGS: usize = 60;
@@ -38,35 +39,22 @@ pub struct InfiniteHorizon {
     pub gain: Mat<f64>,
 }
 
-/// Infinite-horizon cost and gain for `transition = [B A]` and the lower triangle of `hessian = [R S; S' Q]`, inputs first.
+/// Infinite-horizon cost and gain for the transition and the quadratic cost of `stage`, repeated for ever.
 ///
 /// # Errors
-/// [`ControlError::NotPositiveDefinite`] when `R` has no Cholesky factor; [`ControlError::NoStabilisingSolution`] when the
+/// [`ControlError::NotPositiveDefinite`] when a weight of `R` is not positive; [`ControlError::NoStabilisingSolution`] when the
 /// doubling does not converge.
-pub fn solve_dare(
-    transition: MatRef<'_, f64>,
-    hessian: MatRef<'_, f64>,
-    inputs: usize,
-) -> Result<InfiniteHorizon, ControlError> {
-    let states = transition.nrows();
-    let (b, a) = (transition.subcols(0, inputs), transition.subcols(inputs, states));
-    let mut scratch = CholeskyScratch::new(inputs);
-    let not_positive = ControlError::NotPositiveDefinite { stage: 0 };
-
-    let mut cost = hessian.to_owned();
-    let (mut r, _, mut s, mut h) = cost.as_mut().split_at_mut(inputs, inputs);
-    factor(r.as_mut(), &mut scratch).ok_or(not_positive)?;
-    // S := L⁻¹S (as its transpose), BL := B L⁻ᵀ.
-    solve_lower_triangular_in_place(r.as_ref(), s.as_mut().transpose_mut(), Par::Seq);
-    let mut bl = b.to_owned();
-    solve_lower_triangular_in_place(r.as_ref(), bl.as_mut().transpose_mut(), Par::Seq);
-    gemm_lower(h.as_mut(), Accum::Add, s.as_ref(), s.as_ref().transpose(), -1.0);
-    mirror_lower(h.as_mut());
-    let mut h = h.to_owned();
+pub fn solve_dare(stage: &LqStage) -> Result<InfiniteHorizon, ControlError> {
+    let (a, b) = (stage.a(), stage.b());
+    let states = a.nrows();
+    if !stage.cost.input_weight.iter().all(|weight| *weight > 0.0) {
+        return Err(ControlError::NotPositiveDefinite { stage: 0 });
+    }
+    let mut h = stage.cost.state_hessian();
+    let scaled: Mat<f64> = Mat::from_fn(states, b.ncols(), |i, j| b[(i, j)] / stage.cost.input_weight[j]);
     let mut g: Mat<f64> = Mat::zeros(states, states);
-    gemm(g.as_mut(), Accum::Replace, bl.as_ref(), bl.as_ref().transpose(), 1.0);
+    gemm(g.as_mut(), Accum::Replace, scaled.as_ref(), b.transpose(), 1.0);
     let mut a_j = a.to_owned();
-    gemm(a_j.as_mut(), Accum::Add, bl.as_ref(), s.as_ref().transpose(), -1.0);
 
     let mut product: Mat<f64> = Mat::zeros(states, states);
     let mut change = f64::INFINITY;
@@ -87,7 +75,7 @@ pub fn solve_dare(
         }
         add_symmetric(&mut h, &increment);
         if change <= CONVERGED {
-            let solution = finish(transition, hessian, inputs, h, &mut change)?;
+            let solution = finish(stage, h, &mut change)?;
             return if change <= RESIDUAL {
                 Ok(solution)
             } else {
@@ -104,22 +92,14 @@ pub fn solve_dare(
 }
 
 /// The gain that belongs to `P`, by one stage of the recursion, and by how much that stage changes `P`.
-fn finish(
-    transition: MatRef<'_, f64>,
-    hessian: MatRef<'_, f64>,
-    inputs: usize,
-    cost_to_go: Mat<f64>,
-    change: &mut f64,
-) -> Result<InfiniteHorizon, ControlError> {
-    let states = transition.nrows();
-    let size = crate::lq_problem::LqSize { states, inputs, stages: 1, rows: 0 };
-    let mut problem = crate::lq_problem::LqProblem::new(size);
-    problem.stages[0].transition.copy_from(transition);
-    problem.stages[0].hessian.copy_from(hessian);
+fn finish(stage: &LqStage, cost_to_go: Mat<f64>, change: &mut f64) -> Result<InfiniteHorizon, ControlError> {
+    let (states, inputs) = (stage.a().nrows(), stage.b().ncols());
+    let mut problem = LqProblem::new(LqSize { states, inputs, stages: 1, ..LqSize::default() });
+    problem.stages[0].clone_from(stage);
     problem.terminal_hessian.copy_from(&cost_to_go);
-    let mut riccati = crate::riccati::Riccati::new(size);
+    let mut riccati = Riccati::new(problem.size());
     riccati.factorise(&problem)?;
-    let difference = riccati.cost_to_go(0) - &cost_to_go;
+    let difference = riccati.cost_to_go() - &cost_to_go;
     *change = largest(difference.as_ref()) / largest(cost_to_go.as_ref()).max(f64::MIN_POSITIVE);
     Ok(InfiniteHorizon { gain: riccati.gain(0).to_owned(), cost_to_go })
 }

@@ -43,6 +43,28 @@ pub trait QpSolver: core::fmt::Debug {
     ) -> Result<DualReport, QpError>;
 }
 
+/// What every solver asks of its data.
+///
+/// # Errors
+/// [`QpError::TooLarge`] for more rows than it has room for, [`QpError::NotFinite`] for a number that is not finite (an upper bound
+/// may be infinite).
+pub(crate) fn check_data(
+    capacity: usize,
+    gram: MatRef<'_, f64>,
+    slack: &[f64],
+    upper: &[f64],
+) -> Result<(), QpError> {
+    let rows = slack.len();
+    if rows > capacity {
+        return Err(QpError::TooLarge { rows, capacity });
+    }
+    let finite_gram = (0..rows).all(|j| (0..rows).all(|i| gram[(i, j)].is_finite()));
+    if !finite_gram || !crate::kernels::all_finite(slack) || upper.iter().any(|u| u.is_nan()) {
+        return Err(QpError::NotFinite);
+    }
+    Ok(())
+}
+
 /// Largest violation of the optimality conditions of `y`: `|y - clamp(y - (Γ y + h), 0, ρ)|`. Zero exactly at a solution.
 pub fn dual_residual(gram: MatRef<'_, f64>, slack: &[f64], upper: &[f64], y: &[f64]) -> f64 {
     let mut worst: f64 = 0.0;

@@ -3,75 +3,59 @@
 //! Letters and equations: [`crate::riccati`]. Rows of the panels are `(u, x, 1)`; the row of 1 carries the linear terms.
 //!
 //! ```text
-//! W = T' P      (L; Y') L' = columns of u of [R S; S' Q] + T' W'      P_k = Q - Y'Y + T_x' W_x'      K' = -Y' L⁻¹
+//! W = T' P      (L; Y') L' = columns of u of [R 0; 0 Q] + T' W'      P_k = D + J'J - Y'Y + T_x' W_x'      K' = -Y' L⁻¹
 //! ```
+//!
+//! `R` and `D` are diagonal, so they are added where the products have been stored.
 //!
 //! Cost: 1.4 million operations at 60 states and 30 inputs. No allocation. Source: as [`crate::riccati`].
 
 use pulp::{Simd, WithSimd};
 
-use crate::lq_problem::LqStage;
-use crate::panel::{BLOCK, Panel, TILE, Tile, accumulate, mirror, padded, sqrt, transpose, zero_tile};
+use crate::lq_stage::{Layout, LqStage};
+use crate::panel::{BLOCK, Panel, TILE, Tile, accumulate, mirror, sqrt, store, zero_tile};
 
-/// What one stage of the recursion leaves behind.
+/// What one stage of the recursion leaves behind, beside `P_k`.
 #[derive(Clone, Debug)]
 pub(crate) struct StageFactors {
-    /// `P_k`, full symmetric; below it the row `p_k'`.
-    pub cost_to_go: Panel,
     /// `K_k'`; below it the row `k_k'`.
     pub gain: Panel,
     /// Lower triangular `L_k`, zeros above the diagonal.
     pub input_factor: Panel,
 }
 
-/// Panels with rows `(u, x, 1)`, `u` and the rest padded to whole blocks.
+/// Panels over the rows of `z̃ = (u, x, 1)`.
 #[derive(Debug)]
 pub(crate) struct Scratch {
-    /// `[B A]'`.
-    pub transition: Panel,
-    /// `[B A]' P`.
+    /// `[B A d]' P`.
     pub propagated: Panel,
     /// Columns of `u` of `M`, then `(L; Y')`.
     pub elimination: Panel,
-    /// `Q`, lower triangle.
-    pub state_hessian: Panel,
-    /// `[B A]' p`.
+    /// `[B A d]' p`.
     pub carried_gradient: Panel,
 }
 
 impl Scratch {
-    /// Brings a stage into panels.
-    pub fn take(&mut self, stage: &LqStage, inputs: usize, states: usize) {
-        let first_x = padded(inputs);
-        transpose(&stage.transition, 0, inputs, &mut self.transition, 0);
-        transpose(&stage.transition, inputs, states, &mut self.transition, first_x);
-        let stride = self.transition.stride();
-        let entries = self.transition.entries_mut();
-        let one = first_x + states;
-        for (l, value) in stage.defect.iter().enumerate() {
-            entries[l * stride + one] = *value;
-        }
-        for u in 0..inputs {
-            let (from, to) = (stage.hessian.col_as_slice(u), self.elimination.column_mut(u));
-            to[u..inputs].copy_from_slice(&from[u..inputs]);
-            to[first_x..one].copy_from_slice(&from[inputs..]);
-            to[one] = stage.gradient[u];
-        }
-        for x in 0..states {
-            let (from, to) = (stage.hessian.col_as_slice(inputs + x), self.state_hessian.column_mut(x));
-            to[x..states].copy_from_slice(&from[inputs + x..]);
-            to[states] = stage.gradient[inputs + x];
+    pub fn new(layout: Layout) -> Self {
+        Self {
+            propagated: Panel::zeros(layout.rows(), layout.states),
+            elimination: Panel::zeros(layout.rows(), layout.inputs),
+            carried_gradient: Panel::zeros(layout.rows(), 1),
         }
     }
 }
 
 /// One stage backwards; `false`: `H_k` is not positive definite.
 pub(crate) struct EliminateInputs<'a> {
-    pub inputs: usize,
-    pub states: usize,
+    pub layout: Layout,
+    pub stage: &'a LqStage,
     pub scratch: &'a mut Scratch,
+    /// `P_{k+1}`, full symmetric; below it the row `p_{k+1}'`.
     pub next: &'a Panel,
+    /// `p_{k+1}`.
     pub gradient: &'a [f64],
+    /// `P_k` and `p_k'`, to be written.
+    pub cost_to_go: &'a mut Panel,
     pub factors: &'a mut StageFactors,
 }
 
@@ -99,16 +83,16 @@ impl EliminateInputs<'_> {
         true
     }
 
-    /// `W = [B A]' P`.
+    /// `W = [B A d]' P`.
     #[inline(always)]
     fn propagate<S: Simd, const R: usize>(&mut self, simd: S) {
-        let Scratch { transition, propagated, .. } = &mut *self.scratch;
+        let (transition, propagated) = (self.stage.transition(), &mut self.scratch.propagated);
         let rows = transition.stride() / S::F64_LANES;
-        let (depth, next) = (self.states, self.next);
-        for column in (0..self.states).step_by(TILE) {
-            let columns = TILE.min(self.states - column);
+        let (depth, next) = (self.layout.states, self.next);
+        for column in (0..depth).step_by(TILE) {
+            let columns = TILE.min(depth - column);
             for (row, whole) in tiles(0, rows, R) {
-                let operands = ((&*transition, row), (next, column));
+                let operands = ((transition, row), (next, column));
                 if whole {
                     let tile = product::<S, R>(simd, operands, depth);
                     store::<S, R>(propagated, &tile, row, column, columns);
@@ -120,47 +104,46 @@ impl EliminateInputs<'_> {
         }
     }
 
-    /// `p'[B A]`, into the row of 1 of `M`.
+    /// `p'[B A d]`.
     #[inline(always)]
     fn carry_gradient<S: Simd>(&mut self, simd: S) {
-        let Scratch { transition, elimination, state_hessian, carried_gradient, .. } = &mut *self.scratch;
+        let (transition, carried) = (self.stage.transition(), &mut self.scratch.carried_gradient);
         let height = transition.stride() / S::F64_LANES;
         let registers = transition.registers::<S>();
         for (row, whole) in tiles(0, height, 4) {
             if whole {
-                times_vector::<S, 4>(simd, registers, height, self.gradient, carried_gradient, row);
+                times_vector::<S, 4>(simd, registers, height, self.gradient, carried, row);
             } else {
-                times_vector::<S, 1>(simd, registers, height, self.gradient, carried_gradient, row);
+                times_vector::<S, 1>(simd, registers, height, self.gradient, carried, row);
             }
-        }
-        let first_x = padded(self.inputs);
-        let carried = carried_gradient.column(0);
-        for u in 0..self.inputs {
-            elimination.column_mut(u)[first_x + self.states] += carried[u];
-        }
-        for x in 0..self.states {
-            state_hessian.column_mut(x)[self.states] += carried[first_x + x];
         }
     }
 
     /// The columns of `u` of `M`, from the diagonal down.
     #[inline(always)]
     fn input_columns<S: Simd, const R: usize>(&mut self, simd: S) {
-        let Scratch { transition, propagated, elimination, .. } = &mut *self.scratch;
+        let Layout { inputs, states: depth } = self.layout;
+        let transition = self.stage.transition();
+        let Scratch { propagated, elimination, carried_gradient } = &mut *self.scratch;
         let rows = transition.stride() / S::F64_LANES;
-        let depth = self.states;
-        for column in (0..self.inputs).step_by(TILE) {
-            let columns = TILE.min(self.inputs - column);
+        for column in (0..inputs).step_by(TILE) {
+            let columns = TILE.min(inputs - column);
             for (row, whole) in tiles(column / S::F64_LANES, rows, R) {
-                let operands = ((&*transition, row), (&*propagated, column));
+                let operands = ((transition, row), (&*propagated, column));
                 if whole {
                     let tile = product::<S, R>(simd, operands, depth);
-                    add_to::<S, R>(simd, elimination, &tile, row, column, columns);
+                    store::<S, R>(elimination, &tile, row, column, columns);
                 } else {
                     let tile = product::<S, 1>(simd, operands, depth);
-                    add_to::<S, 1>(simd, elimination, &tile, row, column, columns);
+                    store::<S, 1>(elimination, &tile, row, column, columns);
                 }
             }
+        }
+        let (cost, carried) = (&self.stage.cost, carried_gradient.column(0));
+        for u in 0..inputs {
+            let entries = elimination.column_mut(u);
+            entries[u] += cost.input_weight[u];
+            entries[self.layout.one()] += cost.input_gradient[u] + carried[u];
         }
     }
 
@@ -170,7 +153,7 @@ impl EliminateInputs<'_> {
         let panel = &mut self.scratch.elimination;
         let (stride, lanes) = (panel.stride(), S::F64_LANES);
         let registers = stride / lanes;
-        for j in 0..self.inputs {
+        for j in 0..self.layout.inputs {
             let first = j / lanes;
             for (row, whole) in tiles(first, registers, 4) {
                 if whole {
@@ -189,7 +172,7 @@ impl EliminateInputs<'_> {
             }
         }
         // Above the diagonal the panel holds what the tiles left there.
-        for j in 0..self.inputs {
+        for j in 0..self.layout.inputs {
             let column = self.factors.input_factor.column_mut(j);
             for (row, (entry, from)) in column.iter_mut().zip(panel.column(j)).enumerate() {
                 *entry = if row < j { 0.0 } else { *from };
@@ -198,52 +181,67 @@ impl EliminateInputs<'_> {
         true
     }
 
-    /// `P_k = Q - Y'Y + T_x' W_x'`, lower triangle, then mirrored.
+    /// `P_k = D + J'J - Y'Y + T_x' W_x'`, lower triangle, then mirrored; below it `p_k'`.
     #[inline(always)]
     fn cost_to_go<S: Simd, const R: usize>(&mut self, simd: S) {
-        let first_x = padded(self.inputs);
-        let shift = first_x / S::F64_LANES;
-        let Scratch { transition, propagated, elimination, state_hessian, .. } = &*self.scratch;
-        let cost_to_go = &mut self.factors.cost_to_go;
-        let rows = cost_to_go.stride() / S::F64_LANES;
-        let (inputs, states) = (self.inputs, self.states);
+        let Layout { states, .. } = self.layout;
+        let rows = self.cost_to_go.stride() / S::F64_LANES;
         for column in (0..states).step_by(TILE) {
             let columns = TILE.min(states - column);
             for (row, whole) in tiles(column / S::F64_LANES, rows, R) {
-                let eliminated = ((elimination, row + shift), (elimination, column + first_x));
-                let carried = ((transition, row + shift), (propagated, column + first_x));
                 if whole {
-                    let mut tile = product::<S, R>(simd, eliminated, inputs);
-                    subtract_from::<S, R>(simd, state_hessian, &mut tile, row, column);
-                    accumulate(simd, &mut tile, carried.0, carried.1, states);
-                    store::<S, R>(cost_to_go, &tile, row, column, columns);
+                    let tile = self.cost_to_go_tile::<S, R>(simd, row, column);
+                    store::<S, R>(self.cost_to_go, &tile, row, column, columns);
                 } else {
-                    let mut tile = product::<S, 1>(simd, eliminated, inputs);
-                    subtract_from::<S, 1>(simd, state_hessian, &mut tile, row, column);
-                    accumulate(simd, &mut tile, carried.0, carried.1, states);
-                    store::<S, 1>(cost_to_go, &tile, row, column, columns);
+                    let tile = self.cost_to_go_tile::<S, 1>(simd, row, column);
+                    store::<S, 1>(self.cost_to_go, &tile, row, column, columns);
                 }
             }
         }
-        let stride = cost_to_go.stride();
-        mirror(cost_to_go.entries_mut(), stride, states);
+        let (cost, carried) = (&self.stage.cost, self.scratch.carried_gradient.column(0));
+        let first_x = self.layout.first_state();
+        for x in 0..states {
+            let entries = self.cost_to_go.column_mut(x);
+            entries[x] += cost.state_weight[x];
+            entries[states] += cost.state_gradient[x] + carried[first_x + x];
+        }
+        let stride = self.cost_to_go.stride();
+        mirror(self.cost_to_go.entries_mut(), stride, states);
+    }
+
+    #[inline(always)]
+    fn cost_to_go_tile<S: Simd, const R: usize>(&self, simd: S, row: usize, column: usize) -> Tile<S, R> {
+        let Layout { inputs, states } = self.layout;
+        let first_x = self.layout.first_state();
+        let shift = first_x / S::F64_LANES;
+        let Scratch { propagated, elimination, .. } = &*self.scratch;
+        let residuals = &self.stage.cost.residuals;
+        let squares = residuals.panel();
+        let eliminated = ((elimination, row + shift), (elimination, column + first_x));
+        let mut tile = product::<S, R>(simd, eliminated, inputs);
+        tile.iter_mut().flatten().for_each(|sum| *sum = simd.neg_f64s(*sum));
+        accumulate(simd, &mut tile, (squares, row), (squares, column), residuals.len());
+        let carried = ((self.stage.transition(), row + shift), (propagated, column + first_x));
+        accumulate(simd, &mut tile, carried.0, carried.1, states);
+        tile
     }
 
     /// `K' = -Y' L⁻¹`, from the last column to the first.
     #[inline(always)]
     fn gain<S: Simd>(&mut self, simd: S) {
-        let first_x = padded(self.inputs);
-        let StageFactors { gain, input_factor, .. } = &mut *self.factors;
+        let Layout { inputs, .. } = self.layout;
+        let first_x = self.layout.first_state();
+        let StageFactors { gain, input_factor } = &mut *self.factors;
         let registers = gain.stride() / S::F64_LANES;
-        for j in (0..self.inputs).rev() {
+        for j in (0..inputs).rev() {
             let factor = input_factor.column(j);
             let target = gain.column_mut(j);
             target.copy_from_slice(&self.scratch.elimination.column(j)[first_x..]);
             for (row, whole) in tiles(0, registers, 4) {
                 if whole {
-                    eliminate_later::<S, 4>(simd, gain, factor, (j, self.inputs), row);
+                    eliminate_later::<S, 4>(simd, gain, factor, (j, inputs), row);
                 } else {
-                    eliminate_later::<S, 1>(simd, gain, factor, (j, self.inputs), row);
+                    eliminate_later::<S, 1>(simd, gain, factor, (j, inputs), row);
                 }
             }
         }
@@ -307,62 +305,6 @@ fn times_vector<S: Simd, const R: usize>(
         }
     }
     out.registers_mut::<S>()[row..row + R].copy_from_slice(&sums);
-}
-
-/// Writes the first `columns` columns of a tile.
-#[inline(always)]
-fn store<S: Simd, const R: usize>(
-    panel: &mut Panel,
-    tile: &Tile<S, R>,
-    row: usize,
-    column: usize,
-    columns: usize,
-) {
-    let stride = panel.stride() / S::F64_LANES;
-    let registers = panel.registers_mut::<S>();
-    for (c, sums) in tile.iter().enumerate().take(columns) {
-        registers[(column + c) * stride + row..][..R].copy_from_slice(sums);
-    }
-}
-
-/// Adds the first `columns` columns of a tile.
-#[inline(always)]
-fn add_to<S: Simd, const R: usize>(
-    simd: S,
-    panel: &mut Panel,
-    tile: &Tile<S, R>,
-    row: usize,
-    column: usize,
-    columns: usize,
-) {
-    let stride = panel.stride() / S::F64_LANES;
-    let registers = panel.registers_mut::<S>();
-    for (c, sums) in tile.iter().enumerate().take(columns) {
-        let target = &mut registers[(column + c) * stride + row..][..R];
-        for (entry, sum) in target.iter_mut().zip(sums) {
-            *entry = simd.add_f64s(*entry, *sum);
-        }
-    }
-}
-
-/// `tile = panel - tile`; columns beyond the panel's end are left as they are.
-#[inline(always)]
-fn subtract_from<S: Simd, const R: usize>(
-    simd: S,
-    panel: &Panel,
-    tile: &mut Tile<S, R>,
-    row: usize,
-    column: usize,
-) {
-    let stride = panel.stride() / S::F64_LANES;
-    let registers = panel.registers::<S>();
-    for (c, sums) in tile.iter_mut().enumerate() {
-        if let Some(source) = registers.get((column + c) * stride + row..).and_then(|rest| rest.get(..R)) {
-            for (sum, entry) in sums.iter_mut().zip(source) {
-                *sum = simd.sub_f64s(*entry, *sum);
-            }
-        }
-    }
 }
 
 /// `column_j -= Σ_{i<j} column_i L(j, i)` in `R` registers from `row` on.

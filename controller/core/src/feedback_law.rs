@@ -16,10 +16,12 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use delmpc_messages::{Command, ConstraintKind, MAX_JOINTS};
-use faer::{Mat, MatRef};
+use faer::Mat;
+use nalgebra::Vector3;
 
+use crate::horizon_problem::HorizonProblem;
 use crate::kernels::gemv;
-use crate::lq_problem::LqStage;
+use crate::trajectory::Trajectory;
 
 /// A law the command can carry: `u = torque + gain (x - reference)` between bounds, in the order of the tree. The reference is that of
 /// the moment the law begins, from where it moves at constant acceleration.
@@ -61,28 +63,45 @@ impl Law {
 
 /// Keeps what the feedback adds between two cycles from driving the pressure point over the edge of the sole.
 ///
-/// A row `g'u + .. <= bound` of the pressure point has a slack in the plan; the joint that moves it most, an ankle, may use up that
+/// A row `e'y <= bound` of the pressure point has a slack in the plan; the joint that moves it most, an ankle, may use up that
 /// slack and no more. A push acts on the state, not on the torque of the ankle, so this holds while the robot is being pushed.
+///
+/// What a push does change is the force `f` that the foot transmits: by `δf` from the planned one, as measured. With the foot at
+/// rest and the torque of the ankle given, at a point `p` of its axis, the moment about the sole's origin changes by `p × δf`. Where
+/// that and `δf` itself take up slack, the torque has to make room for it, the planned one too.
 pub(crate) fn bound_by_pressure_point(
-    stage: &LqStage,
+    horizon: &HorizonProblem,
     index: usize,
-    (u, x): (MatRef<'_, f64>, MatRef<'_, f64>),
+    solution: &Trajectory,
+    force_change: &Vector3<f64>,
     law: &mut Law,
 ) {
-    let n = law.torque.len();
-    for row in 0..stage.row_count {
-        if stage.row_tag[row].kind != ConstraintKind::CentreOfPressure {
-            continue;
-        }
-        let coefficients = stage.rows.col_as_slice(row);
-        let by_input = (0..n).map(|j| coefficients[j] * u[(j, index)]);
-        let by_state = (0..2 * n).map(|i| coefficients[n + i] * x[(i, index)]);
-        let slack = (stage.row_bound[row] - by_input.sum::<f64>() - by_state.sum::<f64>()).max(0.0);
-        let largest = (0..n).max_by(|a, b| coefficients[*a].abs().total_cmp(&coefficients[*b].abs()));
-        if let Some(j) = largest.filter(|j| coefficients[*j].abs() > f64::EPSILON) {
-            let room = slack / coefficients[j];
+    let problem = &horizon.problem;
+    let stage = &problem.stages[index];
+    let (u, x) = (solution.u(index), solution.x(index));
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    for row in problem.output_rows.iter().filter(|row| row.tag.kind == ConstraintKind::CentreOfPressure) {
+        let value: f64 = (row.coefficients.iter().enumerate())
+            .map(|(output, coefficient)| {
+                let (by_input, by_state, constant) = stage.output(output);
+                coefficient * (dot(by_input, u) + dot(by_state, x) + constant)
+            })
+            .sum();
+        let by_torque = |j: usize| -> f64 {
+            row.coefficients.iter().enumerate().map(|(output, c)| c * stage.output(output).0[j]).sum()
+        };
+        let largest =
+            (0..law.torque.len()).map(|j| (j, by_torque(j))).max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()));
+        if let Some((j, by_torque)) = largest.filter(|(_, by_torque)| by_torque.abs() > f64::EPSILON) {
+            let moment_change = horizon.axis_point(index, j).cross(force_change);
+            let change: f64 = (row.coefficients.iter())
+                .zip(moment_change.iter().chain(force_change.iter()))
+                .map(|(coefficient, change)| coefficient * change)
+                .sum();
+            // A plan that gives way itself is not cut further than the force asks.
+            let room = ((row.bound - value).max(0.0) - change.max(0.0)) / by_torque;
             let (planned, lower, upper) = (law.torque[j], &mut law.lower[j], &mut law.upper[j]);
-            if room >= 0.0 && coefficients[j] > 0.0 {
+            if by_torque > 0.0 {
                 *upper = upper.min(planned + room).max(*lower);
             } else {
                 *lower = lower.max(planned + room).min(*upper);

@@ -18,25 +18,26 @@ use alloc::vec::Vec;
 
 use delmpc_mechanics::errors::{ModelError, StepError};
 use delmpc_mechanics::lobatto::LobattoRule;
-use delmpc_mechanics::stage_batch::{StageBatch, StageInput, TransitionOutput};
+use delmpc_mechanics::stage_batch::{StageBatch, StageInput, TransitionOutput, TransitionRows};
 use delmpc_mechanics::tree::KinematicTree;
-use faer::MatRef;
 
 use crate::lq_problem::LqStage;
+use crate::trajectory::Trajectory;
 
 /// Workspace of the horizon's linearisation.
 #[derive(Clone, Debug)]
 pub struct HorizonDynamics {
     batch: StageBatch,
     middle: Vec<f64>,
+    end: Vec<f64>,
 }
 
 /// The transitions of an LQ problem, to be written.
 struct Transitions<'a>(&'a mut [LqStage]);
 
 impl TransitionOutput for Transitions<'_> {
-    fn transition_column(&mut self, stage: usize, column: usize) -> &mut [f64] {
-        self.0[stage].transition.col_as_slice_mut(column)
+    fn transition(&mut self, stage: usize) -> TransitionRows<'_> {
+        self.0[stage].transition_rows()
     }
 }
 
@@ -46,40 +47,39 @@ impl HorizonDynamics {
     /// # Errors
     /// When the mechanics refuse the tree.
     pub fn new(tree: &KinematicTree, stages: usize) -> Result<Self, ModelError> {
-        let batch = StageBatch::new(tree, &LobattoRule::new(2)?, stages)?;
-        Ok(Self { batch, middle: vec![0.0; tree.dof()] })
+        let batch = StageBatch::new(tree, &LobattoRule::new(2)?, stages)?.without_interior_sensitivities();
+        Ok(Self { batch, middle: vec![0.0; tree.dof()], end: vec![0.0; 2 * tree.dof()] })
     }
 
-    /// Linearises every stage about the nodes `x` (`2n x (N+1)`, columns `(q, q̇)`), the inputs `u` (`n x N`) and lengths (s): fills
-    /// `[B A]` and the defect of every stage.
+    /// Linearises every stage about the nodes `(q, q̇)` and inputs of `nominal`, with these lengths (s): fills transition and defect
+    /// of every stage.
     ///
     /// # Errors
     /// The first stage that is not finite or singular.
     pub fn linearise(
         &mut self,
-        x: MatRef<'_, f64>,
-        u: MatRef<'_, f64>,
+        nominal: &Trajectory,
         lengths: &[f64],
         stages: &mut [LqStage],
     ) -> Result<(), StepError> {
         let n = self.middle.len();
         for (k, &time_step) in lengths.iter().enumerate() {
-            let (q, rate) = column(x, k).split_at(n);
-            let (next_q, next_rate) = column(x, k + 1).split_at(n);
+            let (q, rate) = nominal.x(k).split_at(n);
+            let (next_q, next_rate) = nominal.x(k + 1).split_at(n);
             for (j, middle) in self.middle.iter_mut().enumerate() {
                 *middle = 0.5 * (q[j] + next_q[j]) + 0.125 * time_step * (rate[j] - next_rate[j]);
             }
             let nodes = [q, &self.middle, next_q];
-            self.batch.set_stage(k, &StageInput { nodes, rate, force: column(u, k), time_step })?;
+            self.batch.set_stage(k, &StageInput { nodes, rate, force: nominal.u(k), time_step })?;
         }
-        let (q, rate) = column(x, lengths.len()).split_at(n);
+        let (q, rate) = nominal.x(lengths.len()).split_at(n);
         self.batch.set_end_node(q, rate)?;
         self.batch.linearize(&mut Transitions(stages))?;
         for (k, stage) in stages.iter_mut().enumerate() {
             self.batch.outcome(k)?;
-            self.batch.end_state_into(k, &mut stage.defect)?;
-            for (defect, node) in stage.defect.iter_mut().zip(column(x, k + 1)) {
-                *defect -= node;
+            self.batch.end_state_into(k, &mut self.end)?;
+            for (i, (end, node)) in self.end.iter().zip(nominal.x(k + 1)).enumerate() {
+                stage.set_defect(i, end - node);
             }
         }
         Ok(())
@@ -89,9 +89,4 @@ impl HorizonDynamics {
     pub fn batch(&self) -> &StageBatch {
         &self.batch
     }
-}
-
-/// A column of a column-major matrix.
-fn column(matrix: MatRef<'_, f64>, index: usize) -> &[f64] {
-    matrix.col(index).try_as_col_major().map_or(&[], |column| column.as_slice())
 }

@@ -3,7 +3,6 @@
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt::factor::{LltRegularization, cholesky_in_place, cholesky_in_place_scratch};
 use faer::linalg::matmul::matmul;
-use faer::linalg::matmul::triangular::{self, BlockStructure};
 use faer::{Accum, MatMut, MatRef, Par};
 
 /// `dst (+)= alpha lhs rhs`.
@@ -15,27 +14,6 @@ pub(crate) fn gemm(
     alpha: f64,
 ) {
     matmul(dst, beta, lhs, rhs, alpha, Par::Seq);
-}
-
-/// The lower triangle of `dst (+)= alpha lhs rhs`; above the diagonal `dst` is untouched.
-pub(crate) fn gemm_lower(
-    dst: MatMut<'_, f64>,
-    beta: Accum,
-    lhs: MatRef<'_, f64>,
-    rhs: MatRef<'_, f64>,
-    alpha: f64,
-) {
-    triangular::matmul(
-        dst,
-        BlockStructure::TriangularLower,
-        beta,
-        lhs,
-        BlockStructure::Rectangular,
-        rhs,
-        BlockStructure::Rectangular,
-        alpha,
-        Par::Seq,
-    );
 }
 
 /// `out (+)= alpha matrix x`.
@@ -50,15 +28,6 @@ pub(crate) fn gemv(out: &mut [f64], beta: Accum, matrix: MatRef<'_, f64>, x: &[f
         alpha,
         Par::Seq,
     );
-}
-
-/// Copies the lower triangle onto the upper one.
-pub(crate) fn mirror_lower(mut matrix: MatMut<'_, f64>) {
-    for column in 1..matrix.ncols() {
-        for row in 0..column {
-            matrix[(row, column)] = matrix[(column, row)];
-        }
-    }
 }
 
 /// Largest magnitude; NaN counts as infinite.

@@ -36,8 +36,10 @@ pub mod estimator;
 pub mod fallback;
 mod feedback_law;
 pub mod horizon_dynamics;
+mod horizon_problem;
 pub(crate) mod kernels;
 pub mod lq_problem;
+pub mod lq_stage;
 pub mod model;
 pub mod node_kinematics;
 mod panel;
@@ -51,6 +53,7 @@ pub mod sparse_qp;
 pub mod stage_dynamics;
 mod stop_watch;
 pub mod tasks;
+pub mod trajectory;
 
 /// What a process needs to run a controller.
 pub mod prelude {

@@ -3,18 +3,17 @@
 //! | letter | meaning | shape |
 //! |---|---|---|
 //! | `x_k`, `u_k` | deviation of state and input from the nominal | `n_x`, `n_u` |
-//! | `[B_k A_k]` | transition, columns in the order `z = (u, x)` | `n_x x (n_u + n_x)` |
-//! | `d_k` | defect: where the nominal stage ends minus the next nominal node | `n_x` |
-//! | `[R S; S' Q]`, `(r, q)` | stage cost in `z`, lower triangle | `(n_u + n_x)²` |
+//! | `A_k`, `B_k`, `d_k` | transition; defect: where the nominal stage ends minus the next nominal node | `n_x` rows |
+//! | `R`, `r`, `Q`, `q` | stage cost, as weighted squares ([`crate::lq_stage`]) | `n_u`, `n_x²` |
 //! | `P_N`, `p_N` | terminal cost | `n_x²`, `n_x` |
+//! | `y_k = C_k z_k + c_k` | outputs of a stage that rows limit, here a contact wrench; `z = (u, x)` | `m` |
 //!
 //! ```text
-//! min  Σ_k [ ½ z_k' [R S; S' Q]_k z_k + (r, q)_k' z_k ] + ½ x_N' P_N x_N + p_N' x_N + Σ_soft ρ_i max(0, row_i)
+//! min  Σ_k [ ½ u'R u + r'u + ½ x'Q x + q'x ]_k + ½ x_N' P_N x_N + p_N' x_N + Σ_soft ρ_i max(0, row_i)
 //! s.t. x_{k+1} = A_k x_k + B_k u_k + d_k,   x_0 given,
-//!      u_lower <= u_k <= u_upper,   x_lower <= x_k <= x_upper (k >= 1),   F_k u_k + E_k x_k <= e_k
+//!      u_lower <= u_k <= u_upper,   x_lower <= x_k <= x_upper (k >= 1),   E y_k <= e
 //! ```
 //!
-//! Inputs first: eliminating `u` is then the leading part of one Cholesky factorisation (see [`crate::riccati`]).
 //! A row with an infinite penalty `ρ` is hard; with a finite one it gives way where that is cheaper (an exact penalty: as
 //! long as its multiplier stays below `ρ` it holds exactly). State rows of stage 0 do not exist: nothing can change `x_0`.
 //!
@@ -25,12 +24,14 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use delmpc_messages::ConstraintKind;
-use faer::{Accum, Mat};
+use faer::Mat;
 
-use crate::kernels::gemv;
+pub use crate::lq_stage::{BoxBounds, LqStage};
+use crate::panel::transposed_times;
+use crate::trajectory::Trajectory;
 
 /// Sizes of an [`LqProblem`].
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LqSize {
     /// `n_x`.
     pub states: usize,
@@ -38,11 +39,15 @@ pub struct LqSize {
     pub inputs: usize,
     /// `N`.
     pub stages: usize,
-    /// Room for general constraint rows per stage.
+    /// `m`: outputs of a stage.
+    pub outputs: usize,
+    /// Rows on the outputs of a stage.
     pub rows: usize,
+    /// Room for squared residuals in the cost of a stage.
+    pub residuals: usize,
 }
 
-/// A general row `F u + E x <= bound` of a stage.
+/// What a constraint row is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RowTag {
     /// What it limits.
@@ -61,45 +66,15 @@ impl Default for RowTag {
     }
 }
 
-/// Bounds on a vector, both infinite where there is no limit.
+/// One row `coefficients · y <= bound` on the outputs of every stage.
 #[derive(Clone, Debug, PartialEq)]
-pub struct BoxBounds {
-    /// Lowest values.
-    pub lower: Vec<f64>,
-    /// Highest values.
-    pub upper: Vec<f64>,
-}
-
-impl BoxBounds {
-    /// No bounds on `size` values.
-    pub fn unbounded(size: usize) -> Self {
-        Self { lower: vec![f64::NEG_INFINITY; size], upper: vec![f64::INFINITY; size] }
-    }
-}
-
-/// One stage: transition, cost, constraints.
-#[derive(Clone, Debug)]
-pub struct LqStage {
-    /// `[B A]`, `n_x x (n_u + n_x)`.
-    pub transition: Mat<f64>,
-    /// `d`.
-    pub defect: Vec<f64>,
-    /// Cost Hessian in `z = (u, x)`; only the lower triangle is read.
-    pub hessian: Mat<f64>,
-    /// Cost gradient `(r, q)`.
-    pub gradient: Vec<f64>,
-    /// Bounds on the input; hard.
-    pub input: BoxBounds,
-    /// Bounds on the state at the start of the stage (stage 0: not read); soft or hard by [`LqProblem::state_tags`].
-    pub state: BoxBounds,
-    /// General rows, one per **column**: `(F, E)` in the order of `z`, `(n_u + n_x) x rows`.
-    pub rows: Mat<f64>,
-    /// Right-hand side of every general row.
-    pub row_bound: Vec<f64>,
-    /// What every general row is.
-    pub row_tag: Vec<RowTag>,
-    /// General rows in use.
-    pub row_count: usize,
+pub struct OutputRow {
+    /// On the outputs.
+    pub coefficients: Vec<f64>,
+    /// Right-hand side.
+    pub bound: f64,
+    /// What the row is.
+    pub tag: RowTag,
 }
 
 /// The whole problem. All memory is taken in [`LqProblem::new`].
@@ -118,10 +93,12 @@ pub struct LqProblem {
     pub input_tags: Vec<RowTag>,
     /// Tag of the bounds of every state.
     pub state_tags: Vec<RowTag>,
+    /// Rows on the outputs, the same in every stage.
+    pub output_rows: Vec<OutputRow>,
 }
 
 /// Names one constraint row of a problem: stage and index in the order input upper, input lower, state upper, state lower,
-/// general rows.
+/// rows on the outputs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct RowId {
     /// Stage, `N` for the bounds of the terminal state.
@@ -133,19 +110,7 @@ pub struct RowId {
 impl LqProblem {
     /// A problem of zeros, without bounds.
     pub fn new(size: LqSize) -> Self {
-        let LqSize { states, inputs, stages, rows } = size;
-        let stage = LqStage {
-            transition: Mat::zeros(states, inputs + states),
-            defect: vec![0.0; states],
-            hessian: Mat::zeros(inputs + states, inputs + states),
-            gradient: vec![0.0; inputs + states],
-            input: BoxBounds::unbounded(inputs),
-            state: BoxBounds::unbounded(states),
-            rows: Mat::zeros(inputs + states, rows),
-            row_bound: vec![0.0; rows],
-            row_tag: vec![RowTag::default(); rows],
-            row_count: 0,
-        };
+        let LqSize { states, inputs, stages, .. } = size;
         let input_tag = |row| RowTag { kind: ConstraintKind::Torque, row: row as u32, ..RowTag::default() };
         let state_tag = |row: usize| {
             let (kind, row) = if row < states / 2 {
@@ -157,12 +122,20 @@ impl LqProblem {
         };
         Self {
             size,
-            stages: vec![stage; stages],
+            stages: vec![LqStage::new(size); stages],
             terminal_hessian: Mat::zeros(states, states),
             terminal_gradient: vec![0.0; states],
             terminal_state: BoxBounds::unbounded(states),
             input_tags: (0..inputs).map(input_tag).collect(),
             state_tags: (0..states).map(state_tag).collect(),
+            output_rows: vec![
+                OutputRow {
+                    coefficients: vec![0.0; size.outputs],
+                    bound: f64::INFINITY,
+                    tag: RowTag::default(),
+                };
+                size.rows
+            ],
         }
     }
 
@@ -181,9 +154,7 @@ impl LqProblem {
         match self.part(row) {
             RowPart::Input { index, .. } => self.input_tags[index],
             RowPart::State { index, .. } => self.state_tags[index],
-            RowPart::General { index } => {
-                self.stages.get(row.stage as usize).map_or(RowTag::default(), |stage| stage.row_tag[index])
-            }
+            RowPart::Output { index } => self.output_rows[index].tag,
         }
     }
 
@@ -192,17 +163,20 @@ impl LqProblem {
         match self.part(row) {
             RowPart::Input { index, sign } => target[index] += sign * factor,
             RowPart::State { index, sign } => target[self.size.inputs + index] += sign * factor,
-            RowPart::General { index } => {
-                if let Some(stage) = self.stages.get(row.stage as usize) {
-                    for (t, c) in target.iter_mut().zip(stage.rows.col_as_slice(index)) {
-                        *t += factor * c;
-                    }
+            RowPart::Output { index } => {
+                let Some(stage) = self.stages.get(row.stage as usize) else { return };
+                let (by_input, by_state) = target.split_at_mut(self.size.inputs);
+                for (output, coefficient) in self.output_rows[index].coefficients.iter().enumerate() {
+                    let (c_u, c_x, _) = stage.output(output);
+                    let weight = factor * coefficient;
+                    by_input.iter_mut().zip(c_u).for_each(|(t, c)| *t += weight * c);
+                    by_state.iter_mut().zip(c_x).for_each(|(t, c)| *t += weight * c);
                 }
             }
         }
     }
 
-    /// Right-hand side of a row.
+    /// Right-hand side of a row, less what the constant of the outputs takes up.
     pub fn bound(&self, row: RowId) -> f64 {
         let node = row.stage as usize;
         match self.part(row) {
@@ -213,20 +187,24 @@ impl LqProblem {
                 let bounds = self.state_bounds(node);
                 if sign > 0.0 { bounds.upper[index] } else { -bounds.lower[index] }
             }
-            RowPart::General { index } => {
-                self.stages.get(node).map_or(f64::INFINITY, |stage| stage.row_bound[index])
+            RowPart::Output { index } => {
+                let row = &self.output_rows[index];
+                self.stages.get(node).map_or(f64::INFINITY, |stage| {
+                    let constant =
+                        |(output, coefficient): (usize, &f64)| coefficient * stage.output(output).2;
+                    row.bound - row.coefficients.iter().enumerate().map(constant).sum::<f64>()
+                })
             }
         }
     }
 
     /// Calls `visit(row, violation, scale)` for every row with a finite bound whose value minus bound exceeds
-    /// `threshold * scale`, on a trajectory given by columns. `values` is scratch of at least `rows` entries.
+    /// `threshold * scale`, on a trajectory. `outputs` is scratch of `m` entries.
     pub(crate) fn visit_rows(
         &self,
-        x: &Mat<f64>,
-        u: &Mat<f64>,
+        trajectory: &Trajectory,
         threshold: f64,
-        values: &mut [f64],
+        outputs: &mut [f64],
         mut visit: impl FnMut(RowId, f64, f64),
     ) {
         let LqSize { states, inputs, stages, .. } = self.size;
@@ -238,20 +216,18 @@ impl LqProblem {
                 }
             };
             if let Some(stage) = self.stages.get(node) {
-                visit_box(u.col_as_slice(node), &stage.input, &self.input_tags, 0, &mut check);
+                visit_box(trajectory.u(node), &stage.input, &self.input_tags, 0, &mut check);
             }
             if node > 0 {
                 let bounds = self.state_bounds(node);
-                visit_box(x.col_as_slice(node), bounds, &self.state_tags, 2 * inputs, &mut check);
+                visit_box(trajectory.x(node), bounds, &self.state_tags, 2 * inputs, &mut check);
             }
-            let general = 2 * (inputs + states);
+            let first = 2 * (inputs + states);
             let Some(stage) = self.stages.get(node) else { continue };
-            let values = &mut values[..stage.row_count];
-            let rows = stage.rows.as_ref().subcols(0, stage.row_count).transpose();
-            gemv(values, Accum::Replace, rows.subcols(0, inputs), u.col_as_slice(node), 1.0);
-            gemv(values, Accum::Add, rows.subcols(inputs, states), x.col_as_slice(node), 1.0);
-            for (i, value) in values.iter().enumerate() {
-                check(general + i, value - stage.row_bound[i], stage.row_tag[i].scale);
+            transposed_times(stage.outputs(), trajectory.z(node), outputs);
+            for (i, row) in self.output_rows.iter().enumerate() {
+                let value: f64 = row.coefficients.iter().zip(&*outputs).map(|(c, y)| c * y).sum();
+                check(first + i, value - row.bound, row.tag.scale);
             }
         }
     }
@@ -271,7 +247,7 @@ impl LqProblem {
             }
             index -= states;
         }
-        RowPart::General { index }
+        RowPart::Output { index }
     }
 }
 
@@ -294,5 +270,5 @@ fn visit_box(
 enum RowPart {
     Input { index: usize, sign: f64 },
     State { index: usize, sign: f64 },
-    General { index: usize },
+    Output { index: usize },
 }

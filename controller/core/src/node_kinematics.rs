@@ -9,7 +9,7 @@
 //! `δ(M v) = M ν - ad^D_{M v} η`. Mass centre: `m ċ` is the linear part of `P`, so `∂c/∂q = ∂ċ/∂q̇` is that of `𝓜_j S_j / m`.
 //!
 //! A node is evaluated by itself ([`NodeKinematics::update`]) or taken from a stage-parallel linearisation, which has all of this at
-//! hand ([`NodeKinematics::take`]).
+//! hand ([`NodeKinematics::take_all`]).
 //!
 //! Cost: O(n), no allocation after [`NodeKinematics::new`]. Fixed base.
 //!
@@ -93,17 +93,28 @@ impl NodeKinematics {
         Ok(())
     }
 
-    /// Takes over the start node of a linearised stage; the node behind the last stage is that of stage `batch.stages()`.
-    pub fn take(&mut self, batch: &StageBatch, stage: usize) {
-        for i in 0..self.link_pose_w.len() {
-            self.link_pose_w[i] = batch.link_pose_w(stage, i);
-            self.joint_twist_w[i] = batch.joint_twist_w(stage, i);
-            self.velocity_w[i] = batch.velocity_w(stage, i);
-            self.d_momentum_d_rate[i] = batch.d_momentum_d_rate(stage, i);
-            self.d_momentum_d_q[i] = batch.d_momentum_d_q(stage, i);
+    /// Takes over the start nodes of all linearised stages, and the node behind the last one.
+    ///
+    /// Body by body for all stages that lie together in memory: so each cache line is read once.
+    pub fn take_all(nodes: &mut [Self], batch: &StageBatch) {
+        let together = batch.stages_in_vector();
+        for (vector, nodes) in nodes.chunks_mut(together).enumerate() {
+            let first = vector * together;
+            for body in 0..batch.dof() {
+                for (lane, node) in nodes.iter_mut().enumerate() {
+                    let stage = first + lane;
+                    node.link_pose_w[body] = batch.link_pose_w(stage, body);
+                    node.joint_twist_w[body] = batch.joint_twist_w(stage, body);
+                    node.velocity_w[body] = batch.velocity_w(stage, body);
+                    node.d_momentum_d_rate[body] = batch.d_momentum_d_rate(stage, body);
+                    node.d_momentum_d_q[body] = batch.d_momentum_d_q(stage, body);
+                }
+            }
+            for (lane, node) in nodes.iter_mut().enumerate() {
+                node.momentum = batch.momentum_w(first + lane);
+                node.com = batch.com_w(first + lane);
+            }
         }
-        self.momentum = batch.momentum_w(stage);
-        self.com = batch.com_w(stage);
     }
 
     /// Kinematics of the last [`NodeKinematics::update`].

@@ -17,7 +17,7 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
-use faer::{Mat, MatRef};
+use faer::MatRef;
 use pulp::Simd;
 
 /// Doubles in a block: the widest register.
@@ -51,6 +51,11 @@ impl Panel {
         Self { data: vec![Block([0.0; BLOCK]); stride / BLOCK * columns + 1], stride, columns }
     }
 
+    /// Number of columns.
+    pub fn columns(&self) -> usize {
+        self.columns
+    }
+
     /// Doubles from a column to the next: the padded number of rows.
     pub fn stride(&self) -> usize {
         self.stride
@@ -75,6 +80,13 @@ impl Panel {
     pub fn column_mut(&mut self, column: usize) -> &mut [f64] {
         let stride = self.stride;
         &mut self.entries_mut()[column * stride..][..stride]
+    }
+
+    /// A padded column, and the next one to write.
+    pub fn pair_mut(&mut self, column: usize) -> (&[f64], &mut [f64]) {
+        let stride = self.stride;
+        let (front, back) = self.entries_mut().split_at_mut((column + 1) * stride);
+        (&front[column * stride..], &mut back[..stride])
     }
 
     /// The first `rows` rows as a matrix.
@@ -104,20 +116,86 @@ pub(crate) fn sqrt(x: f64) -> f64 {
     return libm::sqrt(x);
 }
 
-/// `target(j, i) = source(i, j)` for `count` columns of the source from `first` on, into the rows of the target from `row` on. Eight
-/// columns at a time: eight streams in, one out.
-pub(crate) fn transpose(source: &Mat<f64>, first: usize, count: usize, target: &mut Panel, row: usize) {
-    let stride = target.stride;
-    let entries = target.entries_mut();
-    for block in (0..count).step_by(BLOCK) {
-        let width = BLOCK.min(count - block);
-        // Beyond the last column it comes again, and is not written.
-        let columns: [&[f64]; BLOCK] =
-            core::array::from_fn(|i| source.col_as_slice(first + block + i.min(width - 1)));
-        for (l, line) in entries.chunks_exact_mut(stride).take(source.nrows()).enumerate() {
-            let line = &mut line[row + block..][..width];
-            for (entry, column) in line.iter_mut().zip(&columns) {
-                *entry = column[l];
+/// `out = a bᵀ` where `b` has up to [`TILE`] rows and `out` as many columns.
+pub(crate) fn times_transposed(a: &Panel, b: &Panel, out: &mut Panel) {
+    pulp::Arch::new().dispatch(TimesTransposed { a, b, out });
+}
+
+struct TimesTransposed<'a> {
+    a: &'a Panel,
+    b: &'a Panel,
+    out: &'a mut Panel,
+}
+
+impl pulp::WithSimd for TimesTransposed<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Self { a, b, out } = self;
+        let height = out.stride / S::F64_LANES;
+        for row in (0..height).step_by(2) {
+            if row + 2 <= height {
+                let mut tile = zero_tile::<S, 2>(simd);
+                accumulate(simd, &mut tile, (a, row), (b, 0), a.columns);
+                store::<S, 2>(out, &tile, row, 0, TILE.min(out.columns));
+            } else {
+                let mut tile = zero_tile::<S, 1>(simd);
+                accumulate(simd, &mut tile, (a, row), (b, 0), a.columns);
+                store::<S, 1>(out, &tile, row, 0, TILE.min(out.columns));
+            }
+        }
+    }
+}
+
+/// Writes the first `columns` columns of a tile.
+#[inline(always)]
+pub(crate) fn store<S: Simd, const R: usize>(
+    panel: &mut Panel,
+    tile: &Tile<S, R>,
+    row: usize,
+    column: usize,
+    columns: usize,
+) {
+    let stride = panel.stride / S::F64_LANES;
+    let registers = panel.registers_mut::<S>();
+    for (c, sums) in tile.iter().enumerate().take(columns) {
+        registers[(column + c) * stride + row..][..R].copy_from_slice(sums);
+    }
+}
+
+/// `out_j = column_j · vector`, over as many rows as the vector has; one per column.
+pub(crate) fn transposed_times(panel: &Panel, vector: &[f64], out: &mut [f64]) {
+    pulp::Arch::new().dispatch(TransposedTimes { panel, vector, out });
+}
+
+struct TransposedTimes<'a> {
+    panel: &'a Panel,
+    vector: &'a [f64],
+    out: &'a mut [f64],
+}
+
+impl pulp::WithSimd for TransposedTimes<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Self { panel, vector, out } = self;
+        let (vector, _) = S::as_simd_f64s(vector);
+        let height = panel.stride / S::F64_LANES;
+        let registers = panel.registers::<S>();
+        let length = vector.len().min(height);
+        // Four columns at a time: as many chains of additions as hide their latency.
+        for (four, out) in out.chunks_mut(4).enumerate() {
+            let mut sums = [simd.splat_f64s(0.0); 4];
+            for (c, sum) in sums.iter_mut().enumerate().take(out.len()) {
+                let column = &registers[(4 * four + c) * height..][..length];
+                for (entry, value) in column.iter().zip(vector) {
+                    *sum = simd.mul_add_f64s(*entry, *value, *sum);
+                }
+            }
+            for (out, sum) in out.iter_mut().zip(sums) {
+                *out = simd.reduce_sum_f64s(sum);
             }
         }
     }
@@ -209,17 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn transposing_and_mirroring_keep_to_their_place() {
-        let source = Mat::from_fn(11, 13, |i, j| (100 * i + j) as f64);
-        let mut panel = Panel::zeros(16, 11);
-        transpose(&source, 2, 10, &mut panel, 3);
-        for row in 0..16 {
-            for column in 0..11 {
-                let inside = (3..13).contains(&row);
-                let expected = if inside { source[(column, 2 + row - 3)] } else { 0.0 };
-                assert_eq!(panel.column(column)[row], expected, "{row} {column}");
-            }
-        }
+    fn mirroring_keeps_to_its_place() {
         let mut square: Vec<f64> = (0..16 * 11).map(f64::from).collect();
         let before = square.clone();
         mirror(&mut square, 16, 11);
@@ -228,6 +296,24 @@ mod tests {
                 let from = if row < column { row * 16 + column } else { column * 16 + row };
                 assert_eq!(square[column * 16 + row], before[from]);
             }
+        }
+    }
+
+    #[test]
+    fn columns_times_a_vector() {
+        let mut panel = Panel::zeros(13, 7);
+        for column in 0..7 {
+            for row in 0..13 {
+                panel.column_mut(column)[row] = (row as f64 - 4.0) * 0.25 + column as f64;
+            }
+        }
+        let mut vector = Panel::zeros(13, 1);
+        (0..13).for_each(|row| vector.column_mut(0)[row] = 1.0 - 0.5 * row as f64);
+        let mut out = [0.0; 7];
+        transposed_times(&panel, vector.column(0), &mut out);
+        for (column, out) in out.iter().enumerate() {
+            let expected: f64 = panel.column(column).iter().zip(vector.column(0)).map(|(a, b)| a * b).sum();
+            assert!((out - expected).abs() < 1e-13);
         }
     }
 }

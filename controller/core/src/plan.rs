@@ -5,9 +5,7 @@
 
 use alloc::vec::Vec;
 
-use faer::Mat;
-
-use crate::riccati::Trajectory;
+use crate::trajectory::Trajectory;
 
 /// Nominal states `(q, q̇)` and inputs, with the stage lengths.
 #[derive(Clone, Debug)]
@@ -45,7 +43,11 @@ impl Plan {
 
     /// Stage that a time (s of the run) lies in, clamped to the horizon.
     pub fn stage_at(&self, time_s: f64) -> usize {
-        let t = time_s - self.start_s;
+        self.stage_after(time_s - self.start_s)
+    }
+
+    /// Stage at a time after the first node (s), clamped to the horizon.
+    pub fn stage_after(&self, t: f64) -> usize {
         let stages = self.offsets.len() - 1;
         (1..stages).take_while(|&k| self.offsets[k] <= t).count()
     }
@@ -56,7 +58,7 @@ impl Plan {
         let k = self.stage_at(time_s);
         let length = self.offsets[k + 1] - self.offsets[k];
         let t = ((time_s - self.start_s - self.offsets[k]) / length).max(0.0);
-        let (a, b) = (self.values.x.col_as_slice(k), self.values.x.col_as_slice(k + 1));
+        let (a, b) = (self.values.x(k), self.values.x(k + 1));
         if t > 1.0 {
             let beyond = (t - 1.0) * length;
             for i in 0..n {
@@ -87,7 +89,7 @@ impl Plan {
             let share = to.min(end) - from.max(begin);
             if share > 0.0 {
                 covered += share;
-                for (u, value) in input.iter_mut().zip(self.values.u.col_as_slice(k)) {
+                for (u, value) in input.iter_mut().zip(self.values.u(k)) {
                     *u += share * value;
                 }
             }
@@ -97,33 +99,25 @@ impl Plan {
                 *u /= covered;
             }
         } else {
-            input.copy_from_slice(self.values.u.col_as_slice(self.stage_at(from_s)));
+            input.copy_from_slice(self.values.u(self.stage_at(from_s)));
         }
     }
 
     /// Fills `shifted` with this plan as it looks from `start_s` on.
     pub fn shift_into(&self, start_s: f64, shifted: &mut Plan) {
         shifted.start_s = start_s;
-        let Plan { values: Trajectory { x, u }, offsets, .. } = shifted;
+        let Plan { values, offsets, .. } = shifted;
         for (k, offset) in offsets.iter().enumerate() {
-            self.state_at(start_s + offset, x.col_as_slice_mut(k));
+            self.state_at(start_s + offset, values.x_mut(k));
         }
         for k in 0..offsets.len() - 1 {
-            self.mean_input(start_s + offsets[k], start_s + offsets[k + 1], u.col_as_slice_mut(k));
+            self.mean_input(start_s + offsets[k], start_s + offsets[k + 1], values.u_mut(k));
         }
     }
 
     /// Adds deviations to the nominal values.
     pub fn add(&mut self, deviation: &Trajectory) {
-        let add = |target: &mut Mat<f64>, change: &Mat<f64>| {
-            for column in 0..target.ncols() {
-                for (t, c) in target.col_as_slice_mut(column).iter_mut().zip(change.col_as_slice(column)) {
-                    *t += c;
-                }
-            }
-        };
-        add(&mut self.values.x, &deviation.x);
-        add(&mut self.values.u, &deviation.u);
+        self.values.add(deviation);
     }
 }
 
@@ -135,15 +129,15 @@ mod tests {
     /// q = t³ - t, q̇ = 3t² - 1: a cubic is reproduced exactly.
     fn cubic() -> Plan {
         let lengths = [0.1, 0.1, 0.3];
-        let size = LqSize { states: 2, inputs: 1, stages: 3, rows: 0 };
+        let size = LqSize { states: 2, inputs: 1, stages: 3, ..LqSize::default() };
         let mut plan = Plan::new(Trajectory::new(size), &lengths);
         plan.start_s = 5.0;
         for k in 0..4 {
             let t = plan.offsets[k];
-            plan.values.x.col_as_slice_mut(k).copy_from_slice(&[t * t * t - t, 3.0 * t * t - 1.0]);
+            plan.values.x_mut(k).copy_from_slice(&[t * t * t - t, 3.0 * t * t - 1.0]);
         }
         for k in 0..3 {
-            plan.values.u[(0, k)] = k as f64;
+            plan.values.u_mut(k)[0] = k as f64;
         }
         plan
     }
@@ -172,9 +166,9 @@ mod tests {
         assert_eq!(u[0], 2.0);
         let mut shifted = cubic();
         plan.shift_into(5.05, &mut shifted);
-        assert!((shifted.values.u[(0, 0)] - 0.5).abs() < 1e-12);
+        assert!((shifted.values.u(0)[0] - 0.5).abs() < 1e-12);
         let mut state = [0.0; 2];
         plan.state_at(5.05, &mut state);
-        assert_eq!(shifted.values.x.col_as_slice(0), &state);
+        assert_eq!(shifted.values.x(0), &state);
     }
 }

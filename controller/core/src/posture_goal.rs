@@ -13,15 +13,15 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use delmpc_mechanics::errors::ModelError;
-use faer::Mat;
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
 use nalgebra::{Matrix3, Vector3};
 
 use crate::kernels::{CholeskyScratch, factor, vector_mut};
+use crate::lq_stage::{Residuals, StageCost};
 use crate::model::ControllerModel;
 use crate::node_kinematics::NodeKinematics;
 use crate::reference::PostureGoal;
-use crate::tasks::{TaskTargets, TaskWeights, Tasks};
+use crate::tasks::{MAX_RESIDUALS, TaskTargets, TaskWeights, Tasks};
 
 /// Steps of the iteration.
 const MAX_STEPS: usize = 200;
@@ -72,7 +72,7 @@ pub fn reach_posture(
         hand_velocity: 0.0,
         ..weights.clone()
     };
-    let mut tasks = Tasks::new(n, static_weights, model.hand, model.swing_foot);
+    let tasks = Tasks::new(n, static_weights, model.hand, model.swing_foot);
     let mut targets = TaskTargets::new(n);
     targets.posture.copy_from_slice(&home.q);
     targets.com = home.com;
@@ -82,23 +82,24 @@ pub fn reach_posture(
     targets.swing_foot_rotation = home.swing_foot_rotation;
 
     let mut node = NodeKinematics::new(tree);
-    let cost = |q: &[f64], tasks: &mut Tasks, node: &mut NodeKinematics| -> Result<f64, ModelError> {
-        node.update(tree, q, &still)?;
-        let posture: f64 = q.iter().zip(&home.q).map(|(a, b)| (a - b) * (a - b)).sum();
-        let (residuals, _) = tasks.residuals(tree, node, &targets);
-        let cartesian: f64 = residuals.iter().map(|r| r * r).sum();
-        Ok(tasks.weights.posture * posture + cartesian)
-    };
+    let value =
+        |q: &[f64], residuals: &mut Residuals, node: &mut NodeKinematics| -> Result<f64, ModelError> {
+            node.update(tree, q, &still)?;
+            let posture: f64 = q.iter().zip(&home.q).map(|(a, b)| (a - b) * (a - b)).sum();
+            tasks.linearize(tree, node, &targets, 1.0, residuals);
+            let cartesian: f64 = (0..residuals.len()).map(|r| residuals.value(r) * residuals.value(r)).sum();
+            Ok(tasks.weights.posture * posture + cartesian)
+        };
     let mut q = home.q.clone();
-    let mut best = cost(&q, &mut tasks, &mut node)?;
+    let mut cost = StageCost::new(n, 2 * n, MAX_RESIDUALS);
+    let mut best = value(&q, &mut cost.residuals, &mut node)?;
     let mut damping = 1.0;
     let mut scratch = CholeskyScratch::new(n);
     for _ in 0..MAX_STEPS {
         node.update(tree, &q, &still)?;
-        let mut hessian: Mat<f64> = Mat::zeros(2 * n, 2 * n);
-        let mut gradient = vec![0.0; 2 * n];
-        tasks.quadratise(tree, &node, (&q, &still), &targets, 1.0, (hessian.as_mut(), &mut gradient));
-        let mut block = hessian.as_ref().submatrix(0, 0, n, n).to_owned();
+        tasks.quadratise(tree, &node, (&q, &still), &targets, 1.0, &mut cost);
+        let mut block = cost.state_hessian().as_ref().submatrix(0, 0, n, n).to_owned();
+        let gradient = cost.state_linear_term();
         let mut step: Vec<f64> = gradient[..n].iter().map(|g| -g).collect();
         for j in 0..n {
             block[(j, j)] += damping;
@@ -127,7 +128,7 @@ pub fn reach_posture(
                 (q[j] + step[j]).clamp(low.min(q[j]), high.max(q[j]))
             })
             .collect();
-        let candidate = cost(&moved, &mut tasks, &mut node)?;
+        let candidate = value(&moved, &mut cost.residuals, &mut node)?;
         if candidate < best {
             let gain = best - candidate;
             (q, best, damping) = (moved, candidate, (damping * 0.3).max(1e-9));

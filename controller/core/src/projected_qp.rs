@@ -26,10 +26,17 @@
 //!
 //! All new rows sweep together, one matrix product per stage. Rows are scaled to `|g_i| = 1` (`y` and `ρ` with them).
 //!
-//! **Row generation.** On the LQR trajectory no row violated: it is the optimum, nothing is solved. Otherwise the most violated
-//! rows enter, (D) is solved, the trajectory of `w = -G'y` is checked over the whole horizon, rows newly violated enter, until none
-//! is. The optimum over the rows that entered which violates no other row is the optimum over all. When the
-//! room is used up, rows with `y = 0` make place; if there are none, the remaining violated ones are counted as dropped.
+//! **Row generation.** On the LQR trajectory no row violated: it is the optimum, nothing is solved. Otherwise (D) is solved over the
+//! rows that were active at the last solution ([`ProjectedQp::prepare`]), or when there are none over the most violated ones; the
+//! trajectory of `w = -G'y` is checked over the whole horizon, rows newly violated enter, until none is. The optimum over the
+//! rows that entered which violates no other row is the optimum over all. When the room is used up, rows with `y = 0` make
+//! place; if there are none, the remaining violated ones are counted as dropped.
+//!
+//! **Solving (D).** From one cycle to the next the set of active rows hardly changes. So a few partitions of block pivoting
+//! ([`crate::active_set_dual`]) are tried from the last multipliers: one small Cholesky factorisation each, and where the signs
+//! are right the answer is the optimum to round-off. If it does not settle, the interior-point backend solves it.
+//!
+//! Rows and `G G'` depend on the linearisation only, the slacks `h` on `x_0` too: sweeping the rows belongs to the preparation.
 //!
 //! Cost: one rollout O(N n²) per round, one sweep O(j n²) per row, one small QP per round. No allocation after
 //! [`ProjectedQp::new`], other than the backend's.
@@ -41,15 +48,16 @@ use alloc::boxed::Box;
 use alloc::vec;
 use alloc::vec::Vec;
 
-use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
+use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
 use faer::{Accum, Mat, Par};
 
 use crate::active_set_dual::ActiveSetDual;
 use crate::dual_qp::QpSolver;
 use crate::errors::QpError;
-use crate::kernels::{gemm, gemv, vector_mut};
+use crate::kernels::{gemm, gemv};
 use crate::lq_problem::{LqProblem, LqSize, RowId, RowTag};
-use crate::riccati::{Riccati, Trajectory};
+use crate::riccati::Riccati;
+use crate::trajectory::Trajectory;
 
 /// How the row generation proceeds.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -62,11 +70,13 @@ pub struct ProjectedQpOptions {
     pub max_rounds: u32,
     /// A row is violated beyond this part of its scale.
     pub tolerance: f64,
+    /// Partitions of block pivoting tried before the backend is called; 0: the backend solves everything.
+    pub pivots: u32,
 }
 
 impl Default for ProjectedQpOptions {
     fn default() -> Self {
-        Self { capacity: 64, rows_per_round: 24, max_rounds: 8, tolerance: 1e-6 }
+        Self { capacity: 64, rows_per_round: 24, max_rounds: 8, tolerance: 1e-6, pivots: 12 }
     }
 }
 
@@ -86,8 +96,10 @@ pub struct Violation {
 pub struct ProjectedQpReport {
     /// Dual problems solved; 0: the LQR solution is the optimum.
     pub solves: u32,
-    /// Iterations of the backend, summed.
+    /// Iterations of the backend or partitions of block pivoting, summed.
     pub iterations: u32,
+    /// Dual problems that went to the backend.
+    pub backend_solves: u32,
     /// Rows with a positive multiplier at the end.
     pub active_rows: u32,
     /// Violated rows left out because there was no room, or the rounds were over.
@@ -121,14 +133,18 @@ pub struct ProjectedQp {
     v: Mat<f64>,
     lqr: Trajectory,
     violated: Vec<(f64, RowId)>,
-    row_values: Vec<f64>,
-    spare: ActiveSetDual,
+    outputs: Vec<f64>,
+    pivoting: ActiveSetDual,
+    /// Rows with a positive multiplier at the last solution, and the multiplier in the row's own unit.
+    active: Vec<(RowId, f64)>,
+    /// Whether the first rows are those of [`ProjectedQp::prepare`].
+    prepared: bool,
 }
 
 impl ProjectedQp {
     /// Room for problems of this size.
     pub fn new(size: LqSize, options: ProjectedQpOptions) -> Self {
-        let LqSize { states, inputs, stages, rows } = size;
+        let LqSize { states, inputs, stages, outputs, rows, .. } = size;
         let capacity = options.capacity;
         let total_rows = (stages + 1) * (2 * (inputs + states) + rows);
         Self {
@@ -149,12 +165,27 @@ impl ProjectedQp {
             v: Mat::zeros(inputs, stages),
             lqr: Trajectory::new(size),
             violated: Vec::with_capacity(total_rows),
-            row_values: vec![0.0; rows],
-            spare: ActiveSetDual::new(capacity),
+            outputs: vec![0.0; outputs],
+            pivoting: ActiveSetDual::new(capacity),
+            active: Vec::with_capacity(capacity),
+            prepared: false,
         }
     }
 
-    /// Solves the constrained problem from the first column of `trajectory.x`, with the factors of `riccati`.
+    /// What can be done before `x_0` is known: brings the rows that were active at the last solution in.
+    pub fn prepare(&mut self, problem: &LqProblem, riccati: &Riccati) {
+        self.active.sort_unstable_by_key(|(row, _)| core::cmp::Reverse(*row));
+        self.rows.clear();
+        self.rows.extend(self.active.iter().map(|(row, _)| *row));
+        self.sweep(problem, riccati, 0);
+        self.normalise(problem, 0);
+        for (i, (_, multiplier)) in self.active.iter().enumerate() {
+            self.y[i] = (multiplier * self.row_norm[i]).min(self.upper[i]);
+        }
+        self.prepared = true;
+    }
+
+    /// Solves the constrained problem from the first node of `trajectory`, with the factors of `riccati`.
     ///
     /// The trajectory is always finite when the problem's data are: a backend that fails is replaced by the active-set method, and
     /// if that fails too the last good iterate stands.
@@ -169,21 +200,26 @@ impl ProjectedQp {
         trajectory: &mut Trajectory,
     ) -> Result<ProjectedQpReport, QpError> {
         let mut report = ProjectedQpReport::default();
-        self.rows.clear();
+        if !core::mem::take(&mut self.prepared) {
+            self.rows.clear();
+        }
+        let warm = self.rows.len();
+        self.active.clear();
         riccati.rollout(problem, None, trajectory);
         if !trajectory.is_finite() {
             return Err(QpError::NotFinite);
         }
+        self.find_violated(problem, trajectory, &mut report);
+        if report.worst.is_none() {
+            return Ok(report);
+        }
         self.lqr.copy_from(trajectory);
-
-        for _ in 0..self.options.max_rounds {
-            self.find_violated(problem, trajectory, &mut report);
-            let entered = self.admit(problem, riccati);
+        self.complete(problem, 0);
+        for round in 0..self.options.max_rounds {
+            // The rows of the last solution make most of the violated ones superfluous: they go first, alone.
+            let entered = if round == 0 && warm > 0 { warm } else { self.admit(problem, riccati) };
             report.dropped_rows = self.violated.len() as u32;
-            if entered == 0 {
-                break;
-            }
-            if !self.solve_dual(backend, &mut report) {
+            if entered == 0 || !self.solve_dual(backend, &mut report) {
                 break;
             }
             self.recover(riccati);
@@ -192,12 +228,13 @@ impl ProjectedQp {
                 trajectory.copy_from(&self.lqr);
                 break;
             }
-        }
-        if report.solves > 0 {
             self.find_violated(problem, trajectory, &mut report);
             report.dropped_rows = self.violated.len() as u32;
         }
-        report.active_rows = self.y[..self.rows.len()].iter().filter(|y| **y > 0.0).count() as u32;
+        for (i, row) in self.rows.iter().enumerate().filter(|(i, _)| self.y[*i] > 0.0) {
+            self.active.push((*row, self.y[i] / self.row_norm[i]));
+        }
+        report.active_rows = self.active.len() as u32;
         Ok(report)
     }
 
@@ -213,26 +250,20 @@ impl ProjectedQp {
         trajectory: &Trajectory,
         report: &mut ProjectedQpReport,
     ) {
-        let Self { rows, violated, row_values, options, .. } = self;
+        let Self { rows, violated, outputs, options, .. } = self;
         violated.clear();
         report.worst = None;
         let mut worst_relative = 0.0;
-        problem.visit_rows(
-            &trajectory.x,
-            &trajectory.u,
-            options.tolerance,
-            row_values,
-            |row, amount, scale| {
-                let relative = amount / scale;
-                if relative > worst_relative {
-                    worst_relative = relative;
-                    report.worst = Some(Violation { row, tag: problem.tag(row), amount });
-                }
-                if !rows.contains(&row) && violated.len() < violated.capacity() {
-                    violated.push((relative, row));
-                }
-            },
-        );
+        problem.visit_rows(trajectory, options.tolerance, outputs, |row, amount, scale| {
+            let relative = amount / scale;
+            if relative > worst_relative {
+                worst_relative = relative;
+                report.worst = Some(Violation { row, tag: problem.tag(row), amount });
+            }
+            if !rows.contains(&row) && violated.len() < violated.capacity() {
+                violated.push((relative, row));
+            }
+        });
         violated.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
     }
 
@@ -251,7 +282,8 @@ impl ProjectedQp {
         // The sweep takes the rows from the last stage to the first.
         self.rows[first..].sort_unstable_by(|a, b| b.cmp(a));
         self.sweep(problem, riccati, first);
-        self.complete_rows(problem, first);
+        self.normalise(problem, first);
+        self.complete(problem, first);
         entered
     }
 
@@ -281,7 +313,7 @@ impl ProjectedQp {
 
     /// Columns of `G'` for the rows from `first` on, by one backward sweep of all of them together.
     fn sweep(&mut self, problem: &LqProblem, riccati: &Riccati, first: usize) {
-        let LqSize { states, inputs, stages, .. } = self.size;
+        let LqSize { inputs, stages, .. } = self.size;
         let total = self.rows.len();
         self.row_vectors.as_mut().subcols_mut(first, total - first).fill(0.0);
         // Rows first..active are in the sweep.
@@ -292,8 +324,7 @@ impl ProjectedQp {
             let at = k * inputs;
             if count > 0 {
                 // λ holds the adjoint at node k+1; k < N here because a row of node N enters below first.
-                let transition = problem.stages[k].transition.as_ref();
-                let (b, a) = (transition.subcols(0, inputs), transition.subcols(inputs, states));
+                let (a, b) = (problem.stages[k].a(), problem.stages[k].b());
                 let adjoint = self.adjoint.as_ref().subcols(first, count);
                 gemm(
                     self.projected.as_mut().subcols_mut(first, count),
@@ -328,9 +359,24 @@ impl ProjectedQp {
         }
     }
 
-    /// Slack, norm, upper bound and Gram entries of the rows from `first` on.
-    fn complete_rows(&mut self, problem: &LqProblem, first: usize) {
-        let LqSize { inputs, states, stages, .. } = self.size;
+    /// Norm, upper bound and Gram entries of the rows from `first` on.
+    fn normalise(&mut self, problem: &LqProblem, first: usize) {
+        for i in first..self.rows.len() {
+            let column = self.row_vectors.col_as_slice_mut(i);
+            let norm = libm::sqrt(column.iter().map(|entry| entry * entry).sum::<f64>());
+            // A row nothing can change keeps norm 1: its multiplier stays where the box puts it.
+            let norm = if norm > f64::MIN_POSITIVE && norm.is_finite() { norm } else { 1.0 };
+            column.iter_mut().for_each(|entry| *entry /= norm);
+            self.row_norm[i] = norm;
+            self.upper[i] = problem.tag(self.rows[i]).penalty * norm;
+            self.y[i] = 0.0;
+        }
+        self.update_gram(first);
+    }
+
+    /// Slack on the LQR trajectory of the rows from `first` on.
+    fn complete(&mut self, problem: &LqProblem, first: usize) {
+        let LqSize { inputs, stages, .. } = self.size;
         for i in first..self.rows.len() {
             let row = self.rows[i];
             let stage = row.stage as usize;
@@ -338,23 +384,12 @@ impl ProjectedQp {
             problem.add_row(row, 1.0, &mut self.row_buffer);
             let (f, e) = self.row_buffer.split_at(inputs);
             let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-            let mut value = dot(&e[..states], self.lqr.x.col_as_slice(stage));
+            let mut value = dot(e, self.lqr.x(stage));
             if stage < stages {
-                value += dot(f, self.lqr.u.col_as_slice(stage));
+                value += dot(f, self.lqr.u(stage));
             }
-            let column = self.row_vectors.col_as_slice_mut(i);
-            let norm = libm::sqrt(dot(column, column));
-            // A row nothing can change keeps norm 1: its multiplier stays where the box puts it.
-            let norm = if norm > f64::MIN_POSITIVE && norm.is_finite() { norm } else { 1.0 };
-            for entry in column.iter_mut() {
-                *entry /= norm;
-            }
-            self.row_norm[i] = norm;
-            self.slack[i] = (problem.bound(row) - value) / norm;
-            self.upper[i] = problem.tag(row).penalty * norm;
-            self.y[i] = 0.0;
+            self.slack[i] = (problem.bound(row) - value) / self.row_norm[i];
         }
-        self.update_gram(first);
     }
 
     /// Gram entries of the rows from `first` on with all rows.
@@ -377,14 +412,23 @@ impl ProjectedQp {
         let gram = self.gram.as_ref().submatrix(0, 0, total, total);
         let (slack, upper) = (&self.slack[..total], &self.upper[..total]);
         report.solves += 1;
-        match backend.solve(gram, slack, upper, &mut self.y[..total]) {
+        let y = &mut self.y[..total];
+        if self.options.pivots > 0 {
+            let settled = self.pivoting.settle(gram, slack, upper, y, self.options.pivots);
+            if let Ok(Some(dual)) = settled {
+                report.iterations += dual.iterations;
+                return true;
+            }
+        }
+        report.backend_solves += 1;
+        match backend.solve(gram, slack, upper, y) {
             Ok(dual) => report.iterations += dual.iterations,
             Err(_) => {
                 report.backend_failures += 1;
-                match self.spare.solve(gram, slack, upper, &mut self.y[..total]) {
+                match self.pivoting.solve(gram, slack, upper, y) {
                     Ok(dual) => report.iterations += dual.iterations,
                     Err(_) => {
-                        self.y[..total].fill(0.0);
+                        y.fill(0.0);
                         return false;
                     }
                 }
@@ -407,7 +451,7 @@ impl ProjectedQp {
         for k in 0..stages {
             let v = self.v.col_as_slice_mut(k);
             v.copy_from_slice(&self.w[k * inputs..(k + 1) * inputs]);
-            solve_upper_triangular_in_place(riccati.input_factor(k).transpose(), vector_mut(v), Par::Seq);
+            riccati.solve_input_factor_transposed(k, v);
         }
     }
 }

@@ -12,9 +12,9 @@ use clarabel::solver::{DefaultSolver, IPSolver, SolverStatus, SupportedConeT};
 use crate::clarabel_dual::settings;
 use crate::errors::QpError;
 use crate::lq_problem::{LqProblem, LqSize, RowId};
-use crate::riccati::Trajectory;
+use crate::trajectory::Trajectory;
 
-/// Solves `problem` from the first column of `trajectory.x` to `tolerance` and fills the rest; returns the iterations.
+/// Solves `problem` from the first node of `trajectory` to `tolerance` and fills the rest; returns the iterations.
 ///
 /// # Errors
 /// [`QpError`] when Clarabel refuses the data or does not reach a solution.
@@ -27,28 +27,25 @@ pub fn solve_sparse(
     let u_at = |k: usize| k * inputs;
     let x_at = |k: usize| stages * inputs + (k - 1) * states;
     let mut unknowns = stages * (inputs + states);
-    let start: Vec<f64> = trajectory.x.col_as_slice(0).to_vec();
+    let start: Vec<f64> = trajectory.x(0).to_vec();
 
     let mut hessian = Triplets::default();
     let mut gradient = vec![0.0; unknowns];
     for (k, stage) in problem.stages.iter().enumerate() {
-        // Position of z entry i of stage k; None: part of x_0.
-        let place = |i: usize| match (i < inputs, k) {
-            (true, _) => Some(u_at(k) + i),
-            (false, 0) => None,
-            (false, _) => Some(x_at(k) + i - inputs),
-        };
-        for column in 0..inputs + states {
-            if let Some(c) = place(column) {
-                gradient[c] += stage.gradient[column];
-            }
-            for row in column..inputs + states {
-                let value = stage.hessian[(row, column)];
-                match (place(row), place(column)) {
-                    (Some(r), Some(c)) => hessian.add(r.min(c), r.max(c), value),
-                    (None, Some(c)) => gradient[c] += value * start[row - inputs],
-                    _ => {}
-                }
+        for (j, (weight, linear)) in
+            stage.cost.input_weight.iter().zip(&stage.cost.input_gradient).enumerate()
+        {
+            hessian.add(u_at(k) + j, u_at(k) + j, *weight);
+            gradient[u_at(k) + j] += linear;
+        }
+        if k == 0 {
+            continue;
+        }
+        let (state_hessian, linear) = (stage.cost.state_hessian(), stage.cost.state_linear_term());
+        for column in 0..states {
+            gradient[x_at(k) + column] += linear[column];
+            for row in column..states {
+                hessian.add(x_at(k) + column, x_at(k) + row, state_hessian[(row, column)]);
             }
         }
     }
@@ -63,12 +60,12 @@ pub fn solve_sparse(
     let mut bound = Vec::new();
     for (k, stage) in problem.stages.iter().enumerate() {
         for row in 0..states {
-            let mut right = -stage.defect[row];
+            let mut right = -stage.defect(row);
             for j in 0..inputs {
-                matrix.add(bound.len(), u_at(k) + j, stage.transition[(row, j)]);
+                matrix.add(bound.len(), u_at(k) + j, stage.b()[(row, j)]);
             }
             for (j, x) in start.iter().enumerate() {
-                let a = stage.transition[(row, inputs + j)];
+                let a = stage.a()[(row, j)];
                 if k == 0 { right -= a * x } else { matrix.add(bound.len(), x_at(k) + j, a) }
             }
             matrix.add(bound.len(), x_at(k + 1) + row, -1.0);
@@ -79,7 +76,7 @@ pub fn solve_sparse(
 
     let mut coefficients = vec![0.0; inputs + states];
     for node in 0..=stages {
-        let rows = 2 * (inputs + states) + problem.stages.get(node).map_or(0, |stage| stage.row_count);
+        let rows = 2 * (inputs + states) + if node < stages { problem.output_rows.len() } else { 0 };
         for index in 0..rows {
             let is_state = (2 * inputs..2 * (inputs + states)).contains(&index);
             if (is_state && node == 0) || (index < 2 * inputs && node == stages) {
@@ -132,8 +129,8 @@ pub fn solve_sparse(
     }
     for k in 0..stages {
         let x = &solver.solution.x;
-        trajectory.u.col_as_slice_mut(k).copy_from_slice(&x[u_at(k)..u_at(k) + inputs]);
-        trajectory.x.col_as_slice_mut(k + 1).copy_from_slice(&x[x_at(k + 1)..x_at(k + 1) + states]);
+        trajectory.u_mut(k).copy_from_slice(&x[u_at(k)..u_at(k) + inputs]);
+        trajectory.x_mut(k + 1).copy_from_slice(&x[x_at(k + 1)..x_at(k + 1) + states]);
     }
     Ok(iterations)
 }

@@ -25,6 +25,9 @@ use crate::lq_problem::LqStage;
 /// Unknown nodes of the controller's integrator: Simpson, fourth order.
 const UNKNOWN_NODES: usize = 2;
 
+/// To what a step is solved, rad or m: far below what encoders tell.
+const ACCURACY: f64 = 1e-12;
+
 /// Integrator and linearisation for stages of any length.
 #[derive(Clone, Debug)]
 pub struct StageDynamics {
@@ -33,6 +36,7 @@ pub struct StageDynamics {
     time_step: f64,
     state: State,
     rate: Vec<f64>,
+    end: Vec<f64>,
 }
 
 impl StageDynamics {
@@ -43,9 +47,11 @@ impl StageDynamics {
     pub fn new(tree: &KinematicTree) -> Result<Self, ModelError> {
         let time_step = 0.01;
         let rule = LobattoRule::new(UNKNOWN_NODES)?;
-        let integrator = Integrator::new(tree, &rule, time_step, StepOptions::default())?;
+        let options = StepOptions { accuracy: ACCURACY, ..StepOptions::default() };
+        let integrator = Integrator::new(tree, &rule, time_step, options)?;
         let linearizer = Linearizer::new(tree, &integrator, StateCoordinates::Velocity, InputHold::Held)?;
-        Ok(Self { integrator, linearizer, time_step, state: State::zeros(tree), rate: vec![0.0; tree.dof()] })
+        let (rate, end) = (vec![0.0; tree.dof()], vec![0.0; 2 * tree.dof()]);
+        Ok(Self { integrator, linearizer, time_step, state: State::zeros(tree), rate, end })
     }
 
     /// Simulates one stage of `time_step` (s) from `x = (q, q̇)` under the held torque `u` and fills `next` with its end.
@@ -60,14 +66,41 @@ impl StageDynamics {
         time_step: f64,
         next: &mut [f64],
     ) -> Result<(), StepError> {
-        let n = tree.dof();
+        self.set_time_step(time_step)?;
+        self.begin(tree, x)?;
+        self.advance(tree, u, next)
+    }
+
+    /// Length of the steps from now on, s.
+    ///
+    /// # Errors
+    /// Unless it is positive and finite.
+    pub fn set_time_step(&mut self, time_step: f64) -> Result<(), StepError> {
         if time_step != self.time_step {
             self.integrator.set_time_step(time_step)?;
             self.time_step = time_step;
         }
-        let (q, q_dot) = x.split_at(n);
+        Ok(())
+    }
+
+    /// Takes `x = (q, q̇)` for the start of a motion that [`StageDynamics::advance`] goes on with.
+    ///
+    /// # Errors
+    /// When `x` does not fit.
+    pub fn begin(&mut self, tree: &KinematicTree, x: &[f64]) -> Result<(), StepError> {
+        let (q, q_dot) = x.split_at(tree.dof());
         self.state.q.copy_from_slice(q);
         self.integrator.velocities().set_velocity(tree, &mut self.state, q_dot)?;
+        Ok(())
+    }
+
+    /// One more step of the same length, under the held torque `u`; fills `next` with its end. Keeps the momentum from step to step,
+    /// so that the next one starts from the extrapolation of this one.
+    ///
+    /// # Errors
+    /// As [`StageDynamics::simulate`].
+    pub fn advance(&mut self, tree: &KinematicTree, u: &[f64], next: &mut [f64]) -> Result<(), StepError> {
+        let n = tree.dof();
         self.integrator.solve(tree, &self.state, &StepForces::held(u))?;
         self.state.copy_from(self.integrator.next_state());
         self.integrator.velocities().velocity_into(tree, &self.state, &mut self.rate)?;
@@ -90,24 +123,24 @@ impl StageDynamics {
         stage: &mut LqStage,
     ) -> Result<(), StepError> {
         let n = tree.dof();
-        let mut end = core::mem::take(&mut stage.defect);
+        let mut end = core::mem::take(&mut self.end);
         let outcome = self.simulate(tree, x, u, time_step, &mut end);
-        stage.defect = end;
-        outcome?;
-        for (d, node) in stage.defect.iter_mut().zip(next_node) {
-            *d -= node;
+        for (i, (end, node)) in end.iter().zip(next_node).enumerate() {
+            stage.set_defect(i, end - node);
         }
+        self.end = end;
+        outcome?;
         let step = self.linearizer.linearize(tree, &mut self.integrator)?;
-        for column in 0..n {
-            let target = stage.transition.col_as_slice_mut(column);
-            for (row, entry) in target.iter_mut().enumerate() {
-                *entry = step.b(row, column);
+        let mut b = stage.b_mut();
+        for row in 0..2 * n {
+            for column in 0..n {
+                b[(row, column)] = step.b(row, column);
             }
         }
-        for column in 0..2 * n {
-            let target = stage.transition.col_as_slice_mut(n + column);
-            for (row, entry) in target.iter_mut().enumerate() {
-                *entry = step.a(row, column);
+        let mut a = stage.a_mut();
+        for row in 0..2 * n {
+            for column in 0..2 * n {
+                a[(row, column)] = step.a(row, column);
             }
         }
         Ok(())

@@ -23,10 +23,9 @@ use alloc::vec::Vec;
 
 use delmpc_mechanics::spatial::log_rotation;
 use delmpc_mechanics::tree::KinematicTree;
-use faer::{Accum, Mat};
 use nalgebra::{Matrix3, Vector3};
 
-use crate::kernels::{gemm_lower, gemv};
+use crate::lq_stage::{Residuals, StageCost};
 use crate::model::BodyPoint;
 use crate::node_kinematics::NodeKinematics;
 
@@ -116,9 +115,9 @@ impl TaskTargets {
 }
 
 /// Most scalar residuals beside posture and speed.
-const MAX_RESIDUALS: usize = 24;
+pub const MAX_RESIDUALS: usize = 24;
 
-/// The tasks of a robot and the workspace of their quadratisation.
+/// The tasks of a robot.
 #[derive(Clone, Debug)]
 pub struct Tasks {
     /// Weights; may be changed at any time.
@@ -126,10 +125,6 @@ pub struct Tasks {
     hand: Option<BodyPoint>,
     swing_foot: Option<BodyPoint>,
     n: usize,
-    /// One residual's Jacobian times the root of its weight per column, `2n x MAX_RESIDUALS`.
-    jacobian: Mat<f64>,
-    residual: [f64; MAX_RESIDUALS],
-    count: usize,
 }
 
 impl Tasks {
@@ -140,68 +135,59 @@ impl Tasks {
         hand: Option<BodyPoint>,
         swing_foot: Option<BodyPoint>,
     ) -> Self {
-        Self {
-            weights,
-            hand,
-            swing_foot,
-            n,
-            jacobian: Mat::zeros(2 * n, MAX_RESIDUALS),
-            residual: [0.0; MAX_RESIDUALS],
-            count: 0,
-        }
+        Self { weights, hand, swing_foot, n }
     }
 
-    /// Adds the cost of the state tasks over `duration` (s) around the node to `hessian` (lower triangle, `2n x 2n`) and
-    /// `gradient` (`2n`). Torque is not among them.
+    /// Writes the cost of the state tasks over `duration` (s) around the node to the state part of `cost`. Torque is not among them.
     pub fn quadratise(
-        &mut self,
+        &self,
         tree: &KinematicTree,
         node: &NodeKinematics,
         (q, q_dot): (&[f64], &[f64]),
         targets: &TaskTargets,
         duration: f64,
-        (mut hessian, gradient): (faer::MatMut<'_, f64>, &mut [f64]),
+        cost: &mut StageCost,
     ) {
         let n = self.n;
+        let (position, speed) = (self.weights.posture * duration, self.weights.joint_speed * duration);
+        cost.state_weight[..n].fill(position);
+        cost.state_weight[n..].fill(speed);
         for j in 0..n {
-            let (position, speed) = (self.weights.posture * duration, self.weights.joint_speed * duration);
-            hessian[(j, j)] += position;
-            hessian[(n + j, n + j)] += speed;
-            gradient[j] += position * (q[j] - targets.posture[j]);
-            gradient[n + j] += speed * (q_dot[j] - targets.posture_rate[j]);
+            cost.state_gradient[j] = position * (q[j] - targets.posture[j]);
+            cost.state_gradient[n + j] = speed * (q_dot[j] - targets.posture_rate[j]);
         }
-        self.linearize(tree, node, targets, duration);
-        let rows = self.jacobian.as_ref().subcols(0, self.count);
-        gemm_lower(hessian, Accum::Add, rows, rows.transpose(), 1.0);
-        gemv(gradient, Accum::Add, rows, &self.residual[..self.count], 1.0);
+        self.linearize(tree, node, targets, duration, &mut cost.residuals);
     }
 
-    /// Residuals and Jacobians of all Cartesian tasks, times the root of weight and duration.
-    fn linearize(
-        &mut self,
+    /// Residuals and Jacobians of all Cartesian tasks, times the root of weight and duration (s).
+    pub fn linearize(
+        &self,
         tree: &KinematicTree,
         node: &NodeKinematics,
         targets: &TaskTargets,
         duration: f64,
+        residuals: &mut Residuals,
     ) {
-        self.count = 0;
+        residuals.clear();
         let n = self.n;
         let TaskWeights {
             com, com_velocity, spin, hand, hand_velocity, swing_foot, swing_foot_rotation, ..
         } = self.weights.clone();
 
         let residual = node.com() - targets.com;
-        self.push(
+        push(
+            residuals,
             com.map(|w| w * duration),
             &residual,
-            |j| Some((node.d_com_d_q(j), Vector3::zeros())),
+            |j| (node.d_com_d_q(j), Vector3::zeros()),
             0..n,
         );
         let residual = node.com_velocity() - targets.com_velocity;
-        self.push(
+        push(
+            residuals,
             com_velocity.map(|w| w * duration),
             &residual,
-            |j| Some((node.d_com_velocity_d_q(j), node.d_com_d_q(j))),
+            |j| (node.d_com_velocity_d_q(j), node.d_com_d_q(j)),
             0..n,
         );
         let (c, momentum) = (node.com(), node.momentum());
@@ -209,79 +195,65 @@ impl Tasks {
         let d_spin = |j: usize| {
             let (by_q, by_rate) = (node.d_momentum_d_q(j), node.d_momentum_d_rate(j));
             let q = by_q.torque - node.d_com_d_q(j).cross(&momentum.force) - c.cross(&by_q.force);
-            Some((q, by_rate.torque - c.cross(&by_rate.force)))
+            (q, by_rate.torque - c.cross(&by_rate.force))
         };
-        self.push(spin.map(|w| w * duration), &spin_now, d_spin, 0..n);
+        push(residuals, spin.map(|w| w * duration), &spin_now, d_spin, 0..n);
 
         if let Some(point) = self.hand.filter(|_| targets.hand_activity > 0.0) {
             let (position, velocity) = node.point(point.body, &point.position);
             let branch = || tree.branch(point.body).iter().map(|j| *j as usize);
             let weight = [hand * targets.hand_activity * duration; 3];
-            let d_position = |j| Some((node.d_point_d_q(point.body, &position, j).0, Vector3::zeros()));
-            self.push(weight, &(position - targets.hand), d_position, branch());
+            let d_position = |j| (node.d_point_d_q(point.body, &position, j).0, Vector3::zeros());
+            push(residuals, weight, &(position - targets.hand), d_position, branch());
             let weight = [hand_velocity * targets.hand_activity * duration; 3];
             let d_velocity = |j| {
                 let (by_rate, by_q) = node.d_point_d_q(point.body, &position, j);
-                Some((by_q, by_rate))
+                (by_q, by_rate)
             };
-            self.push(weight, &(velocity - targets.hand_velocity), d_velocity, branch());
+            push(residuals, weight, &(velocity - targets.hand_velocity), d_velocity, branch());
         }
         if let Some(point) = self.swing_foot {
             let (position, _) = node.point(point.body, &point.position);
             let branch = || tree.branch(point.body).iter().map(|j| *j as usize);
-            let d_position = |j| Some((node.d_point_d_q(point.body, &position, j).0, Vector3::zeros()));
+            let d_position = |j| (node.d_point_d_q(point.body, &position, j).0, Vector3::zeros());
             let weight = swing_foot.map(|w| w * duration);
-            self.push(weight, &(position - targets.swing_foot), d_position, branch());
+            push(residuals, weight, &(position - targets.swing_foot), d_position, branch());
             // R = exp(r^) R_ref: to first order in r its derivative is the spatial angular velocity.
             let rotation = node.link_pose_w(point.body).rotation;
             let residual = log_rotation(&(rotation * targets.swing_foot_rotation.transpose()));
-            let d_rotation = |j: usize| Some((node.joint_twist_w(j).angular, Vector3::zeros()));
-            self.push([swing_foot_rotation * duration; 3], &residual, d_rotation, branch());
+            let d_rotation = |j: usize| (node.joint_twist_w(j).angular, Vector3::zeros());
+            push(residuals, [swing_foot_rotation * duration; 3], &residual, d_rotation, branch());
         }
     }
+}
 
-    /// Appends the three components of a residual whose weight is not zero.
-    fn push(
-        &mut self,
-        weight: [f64; 3],
-        residual: &Vector3<f64>,
-        derivative: impl Fn(usize) -> Option<(Vector3<f64>, Vector3<f64>)>,
-        joints: impl Iterator<Item = usize>,
-    ) {
-        let first = self.count;
-        let mut columns = [usize::MAX; 3];
-        for axis in 0..3 {
-            if weight[axis] > 0.0 && self.count < MAX_RESIDUALS {
-                columns[axis] = self.count;
-                self.residual[self.count] = libm::sqrt(weight[axis]) * residual[axis];
-                self.count += 1;
-            }
-        }
-        if self.count == first {
-            return;
-        }
-        let n = self.n;
-        self.jacobian.as_mut().subcols_mut(first, self.count - first).fill(0.0);
-        for j in joints {
-            let Some((by_q, by_rate)) = derivative(j) else { continue };
-            for axis in 0..3 {
-                if columns[axis] != usize::MAX {
-                    let root = libm::sqrt(weight[axis]);
-                    self.jacobian[(j, columns[axis])] = root * by_q[axis];
-                    self.jacobian[(n + j, columns[axis])] = root * by_rate[axis];
-                }
-            }
+/// Appends the three components of a residual whose weight is not zero.
+fn push(
+    residuals: &mut Residuals,
+    weight: [f64; 3],
+    value: &Vector3<f64>,
+    derivative: impl Fn(usize) -> (Vector3<f64>, Vector3<f64>),
+    joints: impl Iterator<Item = usize>,
+) {
+    let first = residuals.len();
+    let root = weight.map(libm::sqrt);
+    for axis in 0..3 {
+        if weight[axis] > 0.0 {
+            residuals.push(root[axis] * value[axis]);
         }
     }
-
-    /// Weighted residuals and Jacobian columns (`2n` each) of the Cartesian tasks, for a duration of 1 s. For tests and logs.
-    pub fn residuals(
-        &mut self,
-        tree: &KinematicTree,
-        node: &NodeKinematics,
-        targets: &TaskTargets,
-    ) -> (&[f64], faer::MatRef<'_, f64>) {
-        self.linearize(tree, node, targets, 1.0);
-        (&self.residual[..self.count], self.jacobian.as_ref().subcols(0, self.count))
+    let count = residuals.len() - first;
+    if count == 0 {
+        return;
+    }
+    for j in joints {
+        let (by_q, by_rate) = derivative(j);
+        let axes = (0..3).filter(|&axis| weight[axis] > 0.0);
+        for (residual, axis) in (first..first + count).zip(axes) {
+            let row = residuals.row_mut(residual);
+            let n = row.len() / 2;
+            row[j] = root[axis] * by_q[axis];
+            row[n + j] = root[axis] * by_rate[axis];
+        }
     }
 }

@@ -24,6 +24,10 @@ pub trait Controller {
     /// One control cycle. Fills in all of `command` but its header and which state it answers. `now_ns` is the present time by
     /// the plant's clock.
     fn cycle(&mut self, state: &PlantState, now_ns: u64, command: &mut Command);
+
+    /// What can be done for the next cycle before its state is there; called after a command was sent. The times it took belong in
+    /// the report of the cycle it is for, in the total too.
+    fn prepare(&mut self) {}
 }
 
 /// How a loop ended.
@@ -200,6 +204,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
     fn warm_up(&mut self, controller: &mut impl Controller) {
         for _ in 0..WARM_UP_CYCLES {
             controller.cycle(&self.state, self.state.time_ns + self.delay_ns, &mut self.command);
+            controller.prepare();
         }
     }
 
@@ -220,14 +225,19 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
         command.report.allocations = (after - before) as u32;
         address(command, &self.state);
         let computed_ns = monotonic_ns();
+        let inside_ns = computed_ns - begin_ns;
+        // What the controller had done ahead.
+        let ahead_ns = command.report.total_ns.saturating_sub(inside_ns);
         if realtime {
-            command.report.total_ns = computed_ns - begin_ns;
+            command.report.total_ns = inside_ns + ahead_ns;
             command.header.sent_at_ns = computed_ns;
         }
         self.commands.send(command)?;
         let sent_ns = monotonic_ns();
+        let feedback_ns = computed_ns - if realtime { due_ns.min(begin_ns) } else { begin_ns };
         let figure = CycleFigure {
-            total_ns: computed_ns - if realtime { due_ns.min(begin_ns) } else { begin_ns },
+            total_ns: feedback_ns + ahead_ns,
+            feedback_ns,
             linearize_ns: command.report.linearize_ns,
             riccati_ns: command.report.riccati_ns,
             qp_ns: command.report.qp_ns,
@@ -235,6 +245,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
         };
         self.figures.add(command, figure);
         command.report.publish_ns = if realtime { sent_ns - computed_ns } else { 0 };
+        controller.prepare();
         Ok(sent_ns)
     }
 }

@@ -5,8 +5,10 @@ use delmpc_messages::{Command, CycleReport, FallbackLevel, Verdict};
 /// Figures kept of each cycle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CycleFigure {
-    /// From the tick to the command sent (ns).
+    /// Everything computed for the command, what was prepared ahead included, from the tick on (ns).
     pub total_ns: u64,
+    /// From the tick to the command sent (ns).
+    pub feedback_ns: u64,
     /// Linearising (ns).
     pub linearize_ns: u64,
     /// Riccati recursion (ns).

@@ -54,7 +54,8 @@ fn main() {
     };
     let nodes: Vec<[Vec<f64>; 3]> = (0..STAGES).map(|k| [0.0, 0.5, 1.0].map(|c| node(k, c))).collect();
     // As the controller's transitions lie in memory.
-    let (column, stage) = (2 * n + 4, 3 * n * (2 * n + 4));
+    let row = 3 * n + 4;
+    let stage = 2 * n * row;
     let mut values = vec![0.0; STAGES * stage];
     println!("Atlas, foot-rooted, n = {n}, µs for all {STAGES} stages");
     let only = std::env::args().skip(1).find(|arg| !arg.starts_with("--"));
@@ -78,7 +79,7 @@ fn main() {
         let set_time = time(|| set_all(&mut batch));
         let linearize = time(|| {
             let mut output =
-                TransitionSlice { values: &mut values, stage_stride: stage, column_stride: column };
+                TransitionSlice { values: &mut values, stage_stride: stage, row_stride: row, first_state: n };
             batch.linearize(&mut output).unwrap();
             black_box(&values);
         });

@@ -91,29 +91,54 @@ pub struct StageReport {
     pub change: f64,
 }
 
-/// Where the columns of `[B A]` go.
+/// Where `[B A]` of the stages goes.
 pub trait TransitionOutput {
-    /// Column `column` of `[B A]` of stage `stage`: order `(u, q, q̇)`, at least `2n` long, of which `(q, q̇)` is written.
-    fn transition_column(&mut self, stage: usize, column: usize) -> &mut [f64];
+    /// Room for the rows of stage `stage`.
+    fn transition(&mut self, stage: usize) -> TransitionRows<'_>;
 }
 
-/// All `[B A]` in one slice: column-major, stage after stage.
+/// Rows of `[B A]` of one stage, first those of `q`, then those of `q̇`.
+///
+/// Row-major, because a controller multiplies by `[B A]'`: its columns are then contiguous.
+#[derive(Debug)]
+pub struct TransitionRows<'a> {
+    /// The numbers; those between the parts of a row are left alone.
+    pub values: &'a mut [f64],
+    /// Distance of rows.
+    pub row_stride: usize,
+    /// Where the part of `(q, q̇)` begins in a row; that of `u` begins at 0. At least `n`.
+    pub first_state: usize,
+}
+
+impl TransitionRows<'_> {
+    /// The last place that is written, plus one.
+    fn needed(&self, n: usize) -> usize {
+        (2 * n).saturating_sub(1) * self.row_stride + self.first_state + 2 * n
+    }
+}
+
+/// All `[B A]` in one slice, stage after stage.
 #[derive(Debug)]
 pub struct TransitionSlice<'a> {
     /// The numbers.
     pub values: &'a mut [f64],
     /// Distance of stages.
     pub stage_stride: usize,
-    /// Distance of columns, at least `2n`.
-    pub column_stride: usize,
+    /// Distance of rows, at least `3n`.
+    pub row_stride: usize,
+    /// Where `(q, q̇)` begins in a row, at least `n`.
+    pub first_state: usize,
 }
 
 impl TransitionOutput for TransitionSlice<'_> {
-    fn transition_column(&mut self, stage: usize, column: usize) -> &mut [f64] {
-        let start = stage * self.stage_stride + column * self.column_stride;
-        let start = start.min(self.values.len());
-        let end = (start + self.column_stride).min(self.values.len());
-        &mut self.values[start..end]
+    fn transition(&mut self, stage: usize) -> TransitionRows<'_> {
+        let start = (stage * self.stage_stride).min(self.values.len());
+        let end = (start + self.stage_stride).min(self.values.len());
+        TransitionRows {
+            values: &mut self.values[start..end],
+            row_stride: self.row_stride,
+            first_state: self.first_state,
+        }
     }
 }
 
@@ -278,7 +303,8 @@ fn write<M: StageMemory>(memory: &mut [M], lane: usize, values: &[f64]) {
 ///     batch.set_stage(k, &StageInput { nodes, rate: &[1.0], force: &[0.0], time_step: 0.02 })?;
 /// }
 /// let mut values = vec![0.0; stages * 2 * n * 3 * n];
-/// let mut output = TransitionSlice { values: &mut values, stage_stride: 6 * n * n, column_stride: 2 * n };
+/// let mut output =
+///     TransitionSlice { values: &mut values, stage_stride: 6 * n * n, row_stride: 3 * n, first_state: n };
 /// batch.linearize(&mut output)?;
 /// let mut end = vec![0.0; 2 * n];
 /// for k in 0..stages {
@@ -351,9 +377,23 @@ impl StageBatch {
         })
     }
 
+    /// The same without the sensitivities of the interior nodes, a fifth of the memory that a linearisation writes: for those who
+    /// place the interior nodes otherwise. [`StageBatch::move_interior`] then applies the Newton correction only.
+    pub fn without_interior_sensitivities(mut self) -> Self {
+        with_work!(&mut self.engine, _simd, work => {
+            work.batches.iter_mut().for_each(|batch| batch.interior = Vec::new());
+        });
+        self
+    }
+
     /// Number of stages.
     pub fn stages(&self) -> usize {
         self.stages
+    }
+
+    /// Stages in a vector: what lies together in memory.
+    pub fn stages_in_vector(&self) -> usize {
+        with_work!(&self.engine, _simd, work => work.count())
     }
 
     /// Number of joints `n`.
@@ -414,13 +454,13 @@ impl StageBatch {
         });
     }
 
-    /// Linearises all stages at their nodes and hands the columns of `[B A]` to `output`. The nodes stay; the Newton correction is
+    /// Linearises all stages at their nodes and writes `[B A]` to `output`. The nodes stay; the Newton correction is
     /// part of [`StageBatch::end_state_into`] and [`StageBatch::move_interior`]. No allocation.
     ///
-    /// Columns of a stage whose [`StageBatch::outcome`] is an error are not to be used.
+    /// The transition of a stage whose [`StageBatch::outcome`] is an error is not to be used.
     ///
     /// # Errors
-    /// [`ModelError::Length`] when a column of the output is too short.
+    /// [`ModelError::Length`] when the room for a stage is too short or its parts overlap.
     pub fn linearize(&mut self, output: &mut dyn TransitionOutput) -> Result<(), ModelError> {
         let Self { plan, engine, outcomes, stages, has_end, .. } = self;
         let nodes = *stages + usize::from(*has_end);
@@ -434,11 +474,9 @@ impl StageBatch {
         });
         match short {
             None => Ok(()),
-            Some(got) => Err(ModelError::Length {
-                quantity: "column of the transition",
-                got,
-                expected: 2 * self.plan.n,
-            }),
+            Some((got, expected)) => {
+                Err(ModelError::Length { quantity: "room for a transition", got, expected })
+            }
         }
     }
 
@@ -480,9 +518,11 @@ impl StageBatch {
         at_stage!(self, stage, batch, lane => batch.correction[joint][0].lanes()[lane])
     }
 
-    /// Derivative of the interior node `q^1` of a joint by column `column` of `(u, q, q̇)`.
+    /// Derivative of the interior node `q^1` of a joint by column `column` of `(u, q, q̇)`; zero when they are not kept.
     pub fn interior_sensitivity(&self, stage: usize, joint: usize, column: usize) -> f64 {
-        at_stage!(self, stage, batch, lane => batch.interior[column * self.plan.n + joint].lanes()[lane])
+        at_stage!(self, stage, batch, lane => {
+            batch.interior.get(column * self.plan.n + joint).map_or(0.0, |cell| cell.lanes()[lane])
+        })
     }
 
     /// The solution of the controller's problem for a stage, as deviation of `u`, `q` and `q̇` at its start; see
@@ -698,7 +738,7 @@ impl<M: StageMemory> Work<M> {
         plan: &Plan,
         stages: core::ops::Range<usize>,
         output: &mut dyn TransitionOutput,
-        short: &mut Option<usize>,
+        short: &mut Option<(usize, usize)>,
     ) {
         let (batch, scratch) = (&mut self.batches[stages.start / M::COUNT], &mut self.scratch);
         simd.run(nodes::Evaluate { plan, batch, scratch, full: true });

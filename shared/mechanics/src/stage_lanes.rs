@@ -16,8 +16,6 @@ pub(crate) trait StageMemory: Copy + Default {
     fn fill(x: f64) -> Self;
     fn lanes(&self) -> &[f64];
     fn lanes_mut(&mut self) -> &mut [f64];
-    /// Copies all numbers to the front of `target`, or as many as it holds.
-    fn copy_to(&self, target: &mut [f64]);
 }
 
 impl StageMemory for Quad {
@@ -25,18 +23,13 @@ impl StageMemory for Quad {
     fn fill(x: f64) -> Self {
         Quad::splat(x)
     }
+    #[inline(always)]
     fn lanes(&self) -> &[f64] {
         &self.0
     }
+    #[inline(always)]
     fn lanes_mut(&mut self) -> &mut [f64] {
         &mut self.0
-    }
-    #[inline(always)]
-    fn copy_to(&self, target: &mut [f64]) {
-        match target.first_chunk_mut() {
-            Some(whole) => *whole = self.0,
-            None => target.iter_mut().zip(self.0).for_each(|(t, x)| *t = x),
-        }
     }
 }
 
@@ -50,18 +43,13 @@ impl StageMemory for Oct {
     fn fill(x: f64) -> Self {
         Oct([x; 8])
     }
+    #[inline(always)]
     fn lanes(&self) -> &[f64] {
         &self.0
     }
+    #[inline(always)]
     fn lanes_mut(&mut self) -> &mut [f64] {
         &mut self.0
-    }
-    #[inline(always)]
-    fn copy_to(&self, target: &mut [f64]) {
-        match target.first_chunk_mut() {
-            Some(whole) => *whole = self.0,
-            None => target.iter_mut().zip(self.0).for_each(|(t, x)| *t = x),
-        }
     }
 }
 
@@ -82,8 +70,8 @@ pub(crate) trait StageSimd: Copy {
     fn neg_mul_add(self, a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector;
     /// The larger of `a` and `|x|`; either one for a NaN.
     fn max_abs(self, a: Self::Vector, x: Self::Vector) -> Self::Vector;
-    /// The vectors `rows[0], rows[stride], ..`, as many as there are stages in one, to one vector per stage.
-    fn transpose(self, rows: &[Self::Memory], stride: usize, out: &mut [Self::Memory]);
+    /// As many vectors as there are stages in one, to one vector per stage.
+    fn transpose(self, rows: &[Self::Memory], out: &mut [Self::Memory]);
     /// Runs a kernel with these instructions enabled.
     fn run<K: StageKernel<Self::Memory>>(self, kernel: K);
 }
@@ -139,8 +127,8 @@ impl StageSimd for Portable {
         [a[0].max(x0.abs()), a[1].max(x1.abs()), a[2].max(x2.abs()), a[3].max(x3.abs())]
     }
     #[inline(always)]
-    fn transpose(self, rows: &[Quad], stride: usize, out: &mut [Quad]) {
-        transpose_quads(rows, stride, out);
+    fn transpose(self, rows: &[Quad], out: &mut [Quad]) {
+        transpose_quads(rows, out);
     }
     #[inline(always)]
     fn run<K: StageKernel<Quad>>(self, kernel: K) {
@@ -149,8 +137,8 @@ impl StageSimd for Portable {
 }
 
 #[inline(always)]
-fn transpose_quads(rows: &[Quad], stride: usize, out: &mut [Quad]) {
-    let (a, b, c, d) = (rows[0].0, rows[stride].0, rows[2 * stride].0, rows[3 * stride].0);
+fn transpose_quads(rows: &[Quad], out: &mut [Quad]) {
+    let (a, b, c, d) = (rows[0].0, rows[1].0, rows[2].0, rows[3].0);
     for lane in 0..4 {
         out[lane].0 = [a[lane], b[lane], c[lane], d[lane]];
     }
@@ -158,19 +146,19 @@ fn transpose_quads(rows: &[Quad], stride: usize, out: &mut [Quad]) {
 
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
-fn transpose_quads_with(_: pulp::x86::V3, rows: &[Quad], stride: usize, out: &mut [Quad]) {
-    transpose_quads(rows, stride, out);
+fn transpose_quads_with(_: pulp::x86::V3, rows: &[Quad], out: &mut [Quad]) {
+    transpose_quads(rows, out);
 }
 
 /// Three rounds of eight shuffles: pairs of numbers, pairs of pairs, halves.
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
-fn transpose_octs(simd: pulp::x86::V4, rows: &[Oct], stride: usize, out: &mut [Oct]) {
+fn transpose_octs(simd: pulp::x86::V4, rows: &[Oct], out: &mut [Oct]) {
     let avx = simd.avx512f;
     let zero = pulp::cast::<[f64; 8], core::arch::x86_64::__m512d>([0.0; 8]);
     let mut r = [zero; 8];
     for k in 0..8 {
-        r[k] = pulp::cast(rows[k * stride].0);
+        r[k] = pulp::cast(rows[k].0);
     }
     for odd in 0..2 {
         let mut pairs = [zero; 4];
@@ -240,8 +228,8 @@ macro_rules! with_pulp {
                 self.$max(a, self.$abs(x))
             }
             #[inline(always)]
-            fn transpose(self, rows: &[$memory], stride: usize, out: &mut [$memory]) {
-                $transpose(self, rows, stride, out)
+            fn transpose(self, rows: &[$memory], out: &mut [$memory]) {
+                $transpose(self, rows, out)
             }
             #[inline(always)]
             fn run<K: StageKernel<$memory>>(self, kernel: K) {

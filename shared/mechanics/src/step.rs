@@ -15,7 +15,7 @@
 //! 0.1.
 //!
 //! **Stop.** On the change, never on the residual: its floor `~10 ε max|a^{αβ} Sᵀμ|` grows with the length of the chain. Done
-//! when the next change is predicted below `1e-16 (1 + max|q|)`: what is left of it accumulates in the momenta over many steps
+//! when the next change is predicted below [`StepOptions::accuracy`] times `1 + max|q|`, by default 1e-16: what is left of it accumulates in the momenta over many steps
 //! (stopping at 1e-14 left 1e-10 in an exactly conserved momentum after 500 steps). Or when the change is below `1e-8` and no
 //! longer shrinks: round-off.
 //!
@@ -39,8 +39,6 @@ use crate::state::State;
 use crate::tree::{JointKind, KinematicTree};
 use crate::velocity::VelocityWorkspace;
 
-/// The next change is predicted below this (times `1 + max|q|`): converged.
-const PREDICTED_CHANGE: f64 = 1e-16;
 /// A change below this (times `1 + max|q|`) is converged without prediction.
 const SMALL_CHANGE: f64 = 1e-14;
 /// Below this the iteration may stop when it no longer shrinks: round-off.
@@ -70,6 +68,9 @@ pub struct StepOptions {
     pub variant: NewtonVariant,
     /// Iterations after which the step fails.
     pub max_iterations: usize,
+    /// The iteration ends when the next change of a coordinate is predicted below this, times `1 + max|q|`. At 1e-16, the default,
+    /// invariants hold over many steps; a prediction over a few steps needs less.
+    pub accuracy: f64,
     /// A revolute joint may end a step this far (rad) from where the guess put it; solutions beyond are refused as spurious.
     pub turn_limit: f64,
     /// Room for forces outside the model.
@@ -84,6 +85,7 @@ impl Default for StepOptions {
             method: None,
             variant: NewtonVariant::Broyden,
             max_iterations: 40,
+            accuracy: 1e-16,
             turn_limit: 1.0,
             forces: ForceCapacity::default(),
             dense_fallback: 128,
@@ -431,8 +433,8 @@ impl Integrator {
             }
             let contraction = change / last_change;
             let predicted = change * contraction;
-            if change <= SMALL_CHANGE * size
-                || (iteration > 0 && predicted <= PREDICTED_CHANGE * size)
+            if change <= SMALL_CHANGE.max(self.options.accuracy) * size
+                || (iteration > 0 && predicted <= self.options.accuracy * size)
                 || (change < STAGNATION_CHANGE * size && contraction > 0.5)
             {
                 self.del.evaluate(tree, forces.laws);

@@ -211,8 +211,12 @@ fn warm_batches_of_stages_take_no_memory() {
             }
             batch.set_end_node(&q, &rate).unwrap();
             batch.iterate(2);
-            let mut output =
-                TransitionSlice { values: &mut values, stage_stride: 6 * n * n, column_stride: 2 * n };
+            let mut output = TransitionSlice {
+                values: &mut values,
+                stage_stride: 6 * n * n,
+                row_stride: 3 * n,
+                first_state: n,
+            };
             batch.linearize(&mut output).unwrap();
             for k in 0..stages {
                 batch.outcome(k).unwrap();

@@ -118,20 +118,27 @@ fn fill(batch: &mut StageBatch, stages: &[Stage]) {
 
 fn linearize(mut batch: StageBatch) -> Answer {
     let n = batch.dof();
-    // Columns further apart than they are long, as in padded matrices.
-    let (column, stage) = (2 * n + 3, 3 * n * (2 * n + 3));
+    // Rows further apart than they are long, and their parts too, as in padded matrices.
+    let (first_state, row) = (n + 2, 3 * n + 5);
+    let stage = 2 * n * row;
     let mut values = vec![f64::NAN; STAGES * stage];
     batch
-        .linearize(&mut TransitionSlice { values: &mut values, stage_stride: stage, column_stride: column })
+        .linearize(&mut TransitionSlice {
+            values: &mut values,
+            stage_stride: stage,
+            row_stride: row,
+            first_state,
+        })
         .unwrap();
     let transitions = values
         .chunks(stage)
         .map(|one| {
             assert!(
-                one.chunks(column).all(|c| c[2 * n..].iter().all(|x| x.is_nan())),
+                one.chunks(row)
+                    .all(|r| r[n..first_state].iter().chain(&r[first_state + 2 * n..]).all(|x| x.is_nan())),
                 "wrote into the padding"
             );
-            DMatrix::from_fn(2 * n, 3 * n, |r, c| one[c * column + r])
+            DMatrix::from_fn(2 * n, 3 * n, |r, c| one[r * row + if c < n { c } else { c - n + first_state }])
         })
         .collect();
     let ends = (0..STAGES)
@@ -538,7 +545,7 @@ fn what_does_not_fit_is_refused() {
         assert!(matches!(refused, Err(ModelError::TimeStep { .. })));
     }
     let mut short = [0.0; 47];
-    let mut output = TransitionSlice { values: &mut short, stage_stride: 24, column_stride: 4 };
+    let mut output = TransitionSlice { values: &mut short, stage_stride: 24, row_stride: 6, first_state: 2 };
     length(batch.linearize(&mut output));
     assert!(batch.outcome(0).is_ok() && batch.outcome(2).is_err());
 }

@@ -2,6 +2,7 @@
 #![allow(dead_code)]
 
 use delmpc_controller_core::lq_problem::{LqProblem, LqSize, RowTag};
+use delmpc_controller_core::lq_stage::LqStage;
 use delmpc_messages::ConstraintKind;
 
 /// A small generator (xorshift64*), so that a seed reproduces a problem.
@@ -45,46 +46,35 @@ pub fn problem(seed: u64, size: LqSize, limits: Limits) -> LqProblem {
     let (states, inputs) = (size.states, size.inputs);
     for k in 0..size.stages {
         let stage = &mut problem.stages[k];
-        for i in 0..states {
-            for j in 0..inputs {
-                stage.transition[(i, j)] = 0.3 * random.signed();
-            }
-            for j in 0..states {
-                let diagonal = if i == j { 0.9 + 0.3 * random.signed() } else { 0.0 };
-                stage.transition[(i, inputs + j)] = diagonal + 0.2 / (states as f64).sqrt() * random.signed();
-            }
-            stage.defect[i] = 0.01 * random.signed();
+        transition(stage, size, &mut random);
+        // A full Q = F'F + diagonal.
+        for i in 0..inputs {
+            stage.cost.input_weight[i] = 0.1 + 0.05 * (1.0 + random.signed());
+            stage.cost.input_gradient[i] = 0.05 * random.signed();
         }
-        // z'Mz with M = F'F + diagonal
-        let width = inputs + states;
-        let f: Vec<f64> = (0..width * width).map(|_| random.signed()).collect();
-        for i in 0..width {
-            for j in 0..=i {
-                let product: f64 = (0..width).map(|l| f[l * width + i] * f[l * width + j]).sum();
-                let diagonal = if i == j { 0.1 } else { 0.0 };
-                stage.hessian[(i, j)] = 0.1 * product / width as f64 + diagonal;
-            }
-            stage.gradient[i] = 0.05 * random.signed();
+        for i in 0..states {
+            stage.cost.state_weight[i] = 0.1;
+            stage.cost.state_gradient[i] = 0.05 * random.signed();
+        }
+        stage.cost.residuals.clear();
+        while let Some(row) = stage.cost.residuals.push(0.05 * random.signed()) {
+            row.iter_mut().for_each(|entry| *entry = (0.1 / states as f64).sqrt() * random.signed());
         }
         stage.input.upper.fill(limits.input);
         stage.input.lower.fill(-limits.input);
         stage.state.upper.fill(limits.state);
         stage.state.lower.fill(-limits.state);
-        if limits.row.is_finite() {
-            stage.row_count = size.rows;
-            for row in 0..size.rows {
-                for i in 0..width {
-                    stage.rows[(i, row)] = random.signed();
-                }
-                stage.row_bound[row] = limits.row;
-                stage.row_tag[row] = RowTag {
-                    kind: ConstraintKind::Friction,
-                    row: row as u32,
-                    penalty: limits.penalty,
-                    scale: 1.0,
-                };
-            }
+        for output in 0..size.outputs {
+            let output = stage.output_mut(output);
+            output.by_input.iter_mut().chain(output.by_state).for_each(|c| *c = random.signed());
+            *output.value = 0.1 * random.signed();
         }
+    }
+    for (i, row) in problem.output_rows.iter_mut().enumerate() {
+        row.coefficients[i] = 1.0;
+        row.bound = limits.row;
+        row.tag =
+            RowTag { kind: ConstraintKind::Friction, row: i as u32, penalty: limits.penalty, scale: 1.0 };
     }
     for i in 0..states {
         problem.terminal_hessian[(i, i)] = 1.0;
@@ -94,6 +84,20 @@ pub fn problem(seed: u64, size: LqSize, limits: Limits) -> LqProblem {
     problem.terminal_state.upper.fill(limits.state);
     problem.terminal_state.lower.fill(-limits.state);
     problem
+}
+
+fn transition(stage: &mut LqStage, size: LqSize, random: &mut Random) {
+    let LqSize { states, inputs, .. } = size;
+    for i in 0..states {
+        for j in 0..inputs {
+            stage.b_mut()[(i, j)] = 0.3 * random.signed();
+        }
+        for j in 0..states {
+            let diagonal = if i == j { 0.9 + 0.3 * random.signed() } else { 0.0 };
+            stage.a_mut()[(i, j)] = diagonal + 0.2 / (states as f64).sqrt() * random.signed();
+        }
+        stage.set_defect(i, 0.01 * random.signed());
+    }
 }
 
 pub fn start(seed: u64, states: usize, size: f64) -> Vec<f64> {

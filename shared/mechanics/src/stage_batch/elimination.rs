@@ -13,7 +13,7 @@
 //! ```
 
 use super::column_plan::{Block, Column};
-use super::memory::{Batch, END, Scratch};
+use super::memory::{Batch, END, ROWS_AT_ONCE, Scratch};
 use super::{Plan, SINGULAR_MASS, TransitionOutput, WEIGHTS};
 use crate::stage_lanes::{StageKernel, StageMemory, StageSimd, Stages, load};
 
@@ -273,8 +273,8 @@ pub(crate) struct Columns<'a, 'o, M> {
     pub output: &'o mut dyn TransitionOutput,
     /// Stages of this vector whose columns are wanted.
     pub stages: core::ops::Range<usize>,
-    /// Set to the length of the first column that is too short.
-    pub short: &'a mut Option<usize>,
+    /// Set to the length of the first room that is too short, and to the one needed.
+    pub short: &'a mut Option<(usize, usize)>,
 }
 
 impl<M: StageMemory> StageKernel<M> for Columns<'_, '_, M> {
@@ -358,39 +358,47 @@ fn write<S: StageSimd, const C: usize>(
     let n = plan.n;
     let count = S::Memory::COUNT;
     let Scratch { columns, transposed, .. } = &mut *work.scratch;
-    for (c, column) in block.columns.iter().enumerate() {
-        let index = column.index(n);
-        let interior = &mut work.batch.interior[index * n..(index + 1) * n];
-        for (cell, row) in interior.iter_mut().zip(columns.chunks_exact(3 * C)) {
-            *cell = row[c];
-        }
-        if n >= count {
-            for (place, squares) in transposed.chunks_exact_mut(2 * count).enumerate() {
-                let (position, rate) = squares.split_at_mut(count);
-                let first = (place * count).min(n - count) * 3 * C + c;
-                simd.transpose(&columns[first + C..], 3 * C, position);
-                simd.transpose(&columns[first + 2 * C..], 3 * C, rate);
+    if !work.batch.interior.is_empty() {
+        for (c, column) in block.columns.iter().enumerate() {
+            let index = column.index(n);
+            let interior = &mut work.batch.interior[index * n..(index + 1) * n];
+            for (cell, row) in interior.iter_mut().zip(columns.chunks_exact(3 * C)) {
+                *cell = row[c];
             }
         }
+    }
+    // The 2 C numbers of a joint in every stage: as two squares, which overlap.
+    let overlap = 2 * count - 2 * C;
+    for first in (0..n).step_by(ROWS_AT_ONCE) {
+        let joints = first..n.min(first + ROWS_AT_ONCE);
+        for (joint, squares) in joints.clone().zip(transposed.chunks_exact_mut(2 * count)) {
+            let numbers = &columns[(joint * 3 + 1) * C..][..2 * C];
+            let (front, back) = squares.split_at_mut(count);
+            simd.transpose(numbers, front);
+            simd.transpose(&numbers[2 * C - count..], back);
+        }
         for (lane, stage) in work.stages.clone().enumerate() {
-            let target = work.output.transition_column(stage, index);
-            let length = target.len();
-            let Some(target) = target.get_mut(..2 * n) else {
-                work.short.get_or_insert(length);
+            let rows = work.output.transition(stage);
+            let (length, needed) = (rows.values.len(), rows.needed(n));
+            if length < needed || rows.first_state < n {
+                work.short.get_or_insert((length.min(needed - 1), needed));
                 continue;
-            };
-            let (position, rate) = target.split_at_mut(n);
-            if n >= count {
-                // The last square overlaps the one before where n is no multiple of the stages in a vector.
-                for (place, squares) in transposed.chunks_exact(2 * count).enumerate() {
-                    let first = (place * count).min(n - count);
-                    squares[lane].copy_to(&mut position[first..]);
-                    squares[count + lane].copy_to(&mut rate[first..]);
-                }
-            } else {
-                for (joint, (position, rate)) in position.iter_mut().zip(rate).enumerate() {
-                    *position = columns[(joint * 3 + 1) * C + c].lanes()[lane];
-                    *rate = columns[(joint * 3 + 2) * C + c].lanes()[lane];
+            }
+            let stride = rows.row_stride;
+            let mut places = [0; C];
+            for (place, column) in places.iter_mut().zip(&block.columns) {
+                let index = column.index(n);
+                *place = if index < n { index } else { index - n + rows.first_state };
+            }
+            let (positions, rates) = rows.values.split_at_mut(n * stride);
+            for (joint, squares) in joints.clone().zip(transposed.chunks_exact(2 * count)) {
+                let (front, back) = (squares[lane].lanes(), squares[count + lane].lanes());
+                let position = &mut positions[joint * stride..];
+                let rate = &mut rates[joint * stride..];
+                for (c, &place) in places[..block.columns.len()].iter().enumerate() {
+                    position[place] = front[c];
+                    let c = C + c;
+                    rate[place] = if c < count { front[c] } else { back[c - count + overlap] };
                 }
             }
         }

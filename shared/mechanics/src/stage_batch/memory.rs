@@ -6,6 +6,9 @@ use alloc::vec::Vec;
 use super::NODES;
 use crate::stage_lanes::StageMemory;
 
+/// Joints whose finished numbers are turned from vectors of stages to stages at a time: what the first-level cache holds easily.
+pub(crate) const ROWS_AT_ONCE: usize = 8;
+
 /// One vector of stages: inputs and results.
 #[derive(Clone, Debug)]
 pub(crate) struct Batch<M> {
@@ -121,7 +124,7 @@ pub(crate) struct Scratch<M> {
     pub sides: Vec<[M; 7]>,
     /// Block of columns that is being solved: `[(joint 3 + row) columns + column]`.
     pub columns: Vec<M>,
-    /// One column, stage by stage: squares of positions and of rates in turn.
+    /// Finished numbers of some joints, stage by stage: two squares per joint.
     pub transposed: Vec<M>,
 }
 
@@ -147,7 +150,7 @@ impl<M: StageMemory> Scratch<M> {
             backward: vec![[M::default(); 7]; pairs],
             sides: vec![[M::default(); 7]; pairs],
             columns: vec![M::default(); 3 * n * columns],
-            transposed: vec![M::default(); 2 * n.next_multiple_of(M::COUNT)],
+            transposed: vec![M::default(); 2 * M::COUNT * ROWS_AT_ONCE],
         }
     }
 }
