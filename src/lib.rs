@@ -16,6 +16,7 @@
 //! | [`one_process`] | both loops in one process |
 //! | [`truth`], [`observer`], [`metrics`], [`sole`] | what happened, and the figures made of it |
 //! | [`summary`] | all figures, success, the table a person reads |
+//! | [`stance`] | how a robot stands in its postures, for the table of `delmpc model` |
 //! | [`drawing`] | a robot in its postures as SVG |
 //! | [`completions`] | what a shell needs to complete our words |
 //! | [`log`], [`log_viewer`] | the log of states, commands and truth, and what shows the robot to viewers of logs |
@@ -46,6 +47,7 @@ pub mod run_folder;
 pub mod setup;
 pub mod simulated_robot;
 pub mod sole;
+pub mod stance;
 pub mod status_line;
 pub mod steering;
 pub mod summary;

@@ -43,7 +43,7 @@ class Page {
       high = Math.max(high, pose[11] + 0.5 * Math.max(...shape.size));
     }
     this.view.camera.target = [motion.com[0] + 0.05 * high, motion.com[1], 0.47 * high];
-    this.view.camera.distance = 1.85 * high;
+    this.view.camera.distance = 2.05 * high;
   }
 
   moveCamera(button) {
