@@ -15,7 +15,7 @@ use nalgebra::{Vector2, Vector3};
 use crate::report::scene::shapes;
 
 /// Largest edge of a piece of a box (m).
-const PIECE_M: f64 = 0.16;
+const PIECE_M: f64 = 0.08;
 /// Segments of a round shape.
 const SEGMENTS: usize = 20;
 /// From where it is seen: angles from the front to the left, and up (rad).
