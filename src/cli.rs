@@ -56,7 +56,7 @@ The folder of a run:
   scenario.toml, robot.*      everything it takes to run it again
   messages.txt                what the two processes said
 
-A scenario key is overridden by its full name, with a value as in TOML: --set reach.ball_m=[0.7,0.2,0.6]
+A scenario key is overridden by its full name, with a value as in TOML: --set reach.ball_m=[0.7,0.2,0.6]. \
 An unknown key or a value out of range is refused, with the nearest one allowed.";
 
 const PUSH_MAP_EXAMPLES: &str = "\
@@ -67,8 +67,8 @@ Examples:
   delmpc push-map configs/examples/lamp/reach.toml --link upper_arm --json
   delmpc push-map --set sensors.noise_scale=5 --out /tmp/noisy
 
-A push is survived when the robot does not fall, keeps its other foot in the air and comes to rest. Beside each
-limit stands the capture limit: what an inverted pendulum with a massless leg survives in that direction.";
+A push is survived when the robot does not fall, keeps its other foot in the air and comes to rest. \
+Beside each limit stands the capture limit: what an inverted pendulum with a massless leg survives in that direction.";
 
 const REPLAY_EXAMPLES: &str = "\
 Examples:

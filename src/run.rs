@@ -135,7 +135,8 @@ fn run_in_two_processes(
             watch.look();
         }
         if let Some(text) = line.as_mut().and_then(StatusLine::look) {
-            let _ = write!(std::io::stderr(), "\r\x1b[K{text}");
+            // Cut off where the terminal ends: what wraps could not be overwritten.
+            let _ = write!(std::io::stderr(), "\r\x1b[K\x1b[?7l{text}\x1b[?7h");
         }
     });
     if show {
