@@ -9,6 +9,7 @@ use delmpc_controller_core::prelude::*;
 use delmpc_mechanics::prelude::*;
 use delmpc_messages::{PlantState, joint_set_hash};
 
+/// Brings the mass upright, and fails when it is not.
 pub fn main() -> Result<(), Box<dyn Error>> {
     let (tree, limits) = robot()?;
     let mut real = Simulation::new(&tree, [0.0, 0.05])?;

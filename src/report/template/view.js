@@ -285,6 +285,9 @@ class View {
       }
     }
     triangles.sort((x, y) => y.depth - x.depth);
+    // Wide enough to close the seams between two triangles.
+    paper.lineWidth = 1;
+    paper.lineJoin = "round";
     for (const { a, b, c, style } of triangles) {
       paper.fillStyle = paper.strokeStyle = style;
       paper.beginPath();
