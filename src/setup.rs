@@ -85,11 +85,8 @@ impl Setup {
         if joints > MAX_JOINTS {
             return Err(format!("`robot.urdf`: {joints} joints, but a message has room for {MAX_JOINTS}"));
         }
-        if let Some(joint) = robot.actuated.iter().position(|&actuated| !actuated) {
-            let name = &robot.joint_names[joint];
-            return Err(format!(
-                "`robot.urdf`: joint {name} has no motor, and the controller needs one on every joint"
-            ));
+        if let Some(why) = crate::stance::undriven(robot).into_iter().next() {
+            return Err(format!("`robot.urdf`: {why}"));
         }
         let soles = robot.soles.iter().map(|sole| sole.name.as_str());
         one_of("robot.stance", "sole", &scenario.robot.stance, soles)?;

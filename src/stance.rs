@@ -42,10 +42,10 @@ impl Stance<'_> {
 /// # Errors
 /// When a posture does not fit the tree.
 pub fn stances(robot: &RobotModel) -> Result<(String, Vec<String>), ModelError> {
-    let (mut text, mut warnings) = (String::new(), Vec::new());
     if !robot.tree.is_floating() {
-        return Ok((text, warnings));
+        return Ok((String::new(), Vec::new()));
     }
+    let (mut text, mut warnings) = (String::new(), undriven(robot));
     if robot.soles.is_empty() || robot.postures.is_empty() {
         let table = robot.file.with_extension("toml");
         let missing = if robot.soles.is_empty() { "sole" } else { "posture" };
@@ -129,6 +129,25 @@ fn soles_in<'a>(
     Ok(stances.collect())
 }
 
+/// What keeps a controller from driving a joint, in words: one for every such joint.
+pub fn undriven(robot: &RobotModel) -> Vec<String> {
+    let joints = robot.joint_names.iter().zip(&robot.limits).zip(&robot.actuated);
+    let why = joints.filter_map(|((name, limit), &actuated)| {
+        if !actuated {
+            Some(format!("joint `{name}` has no motor, and the controller needs one on every joint"))
+        } else if limit.effort <= 0.0 {
+            Some(format!("joint `{name}` has effort 0, so no torque: give its <limit> the largest there is"))
+        } else if limit.velocity <= 0.0 {
+            Some(format!(
+                "joint `{name}` has velocity 0, so it cannot move: give its <limit> the largest there is"
+            ))
+        } else {
+            None
+        }
+    });
+    why.collect()
+}
+
 struct Holding {
     text: String,
     warning: Option<String>,
@@ -146,7 +165,11 @@ fn holding(robot: &RobotModel, posture: &Posture, sole: &Sole) -> Result<Holding
     kinematics.update_positions(tree, &Configuration::fixed(q))?;
     let mut torque = vec![0.0; tree.joint_count()];
     gravity_force_into(tree, &kinematics, &mut InverseDynamicsWorkspace::new(tree), &mut torque)?;
-    let loads = torque.iter().zip(&standing.limits).map(|(torque, limit)| torque.abs() / limit.effort);
+    // Of a joint without any torque something else is said.
+    let loads = torque.iter().zip(&standing.limits).map(|(torque, limit)| match limit.effort > 0.0 {
+        true => torque.abs() / limit.effort,
+        false => 0.0,
+    });
     let largest = loads.zip(&standing.joint_names).max_by(|a, b| a.0.total_cmp(&b.0));
     let (load, joint) = largest.map_or((0.0, "-"), |(load, joint)| (load, joint.as_str()));
     let percent = 100.0 * load;

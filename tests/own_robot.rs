@@ -138,19 +138,43 @@ fn a_posture_that_cannot_stand_is_told_why() {
     }
 }
 
-#[test]
-fn a_joint_without_a_motor_is_refused_before_anything_runs() {
-    let folder = clone_of_configs("passive");
-    let read = |file| std::fs::read_to_string(folder.join("configs/examples/lamp").join(file)).unwrap();
-    let table = read("lamp.toml").replacen("format = 1", "format = 1\npassive = [\"elbow\"]", 1);
-    for (file, text) in
-        [("lamp.toml", table), ("lamp.urdf", read("lamp.urdf")), ("reach.toml", read("reach.toml"))]
-    {
-        std::fs::write(folder.join(file), text).unwrap();
+/// Exit status and errors of a run of the lamp with a file changed.
+fn run_changed(name: &str, file: &str, from: &str, to: &str) -> (Option<i32>, String) {
+    let folder = clone_of_configs(name);
+    for copied in ["lamp.urdf", "lamp.toml", "reach.toml"] {
+        let text = std::fs::read_to_string(folder.join("configs/examples/lamp").join(copied)).unwrap();
+        let changed = if copied == file { text.replacen(from, to, 1) } else { text.clone() };
+        assert!(copied != file || changed != text, "{from}");
+        std::fs::write(folder.join(copied), changed).unwrap();
     }
-    let output = Command::new(PROGRAM).args(["run", "reach.toml"]).current_dir(&folder).output().unwrap();
+    let output = Command::new(PROGRAM)
+        .args(["run", "reach.toml", "--set", "clock=lockstep"])
+        .current_dir(&folder)
+        .output()
+        .unwrap();
     std::fs::remove_dir_all(&folder).unwrap();
-    let errors = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(2), "{errors}");
-    assert!(errors.contains("joint elbow has no motor"), "{errors}");
+    (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+}
+
+#[test]
+fn a_joint_that_cannot_be_driven_is_refused_before_anything_runs() {
+    let passive = "format = 1\npassive = [\"elbow\"]";
+    for (name, file, from, to, said) in [
+        ("passive", "lamp.toml", "format = 1", passive, "joint `elbow` has no motor"),
+        ("weak", "lamp.urdf", "effort=\"30\"", "effort=\"0\"", "joint `elbow` has effort 0"),
+        ("stiff", "lamp.urdf", "velocity=\"8\"", "velocity=\"0\"", "joint `swivel` has velocity 0"),
+        ("typo", "reach.toml", "hand = \"bulb\"", "hand = \"blub\"", "it has sole_centre, bulb"),
+    ] {
+        let (status, errors) = run_changed(name, file, from, to);
+        assert_eq!(status, Some(2), "{name}: {errors}");
+        assert!(errors.contains(said), "{name}: {errors}");
+    }
+}
+
+#[test]
+fn a_ball_out_of_reach_is_told_at_once() {
+    let far = "ball_m = [3.0, 0.2, 0.4]";
+    let (status, errors) = run_changed("far-ball", "reach.toml", "ball_m = [0.3, 0.2, 0.4]", far);
+    assert_eq!(status, Some(1), "{errors}");
+    assert!(errors.contains("no balanced posture brings the hand nearer to the ball than 2."), "{errors}");
 }
