@@ -183,11 +183,11 @@ fn missed_criterion(scenario: &Scenario, plant: &PlantPart) -> Option<String> {
     let realtime = scenario.clock == Clock::Realtime;
     let at_most = |key: &str, value: Option<f64>, most: f64| {
         let value = value.filter(|value| value.is_nan() || *value > most)?;
-        Some(format!("{key} = {value:.4}, allowed is at most {most}"))
+        Some(format!("{key} = {value:.4}, allowed is at most {}", plain(most)))
     };
     let at_least = |key: &str, value: Option<f64>, least: f64| {
         let value = value.filter(|value| value.is_nan() || *value < least)?;
-        Some(format!("{key} = {value:.4}, needed is at least {least}"))
+        Some(format!("{key} = {value:.4}, needed is at least {}", plain(least)))
     };
     at_most("hand_error_at_deadline_m", robot.hand_error_at_deadline_m, limit.hand_error_at_deadline_m)
         .or_else(|| {
@@ -208,6 +208,12 @@ fn missed_criterion(scenario: &Scenario, plant: &PlantPart) -> Option<String> {
             let factor = plant.plant_real_time_factor.filter(|_| realtime);
             at_least("plant_real_time_factor", factor, limit.min_real_time_factor)
         })
+}
+
+/// A limit as somebody would write it: no more digits than are compared.
+fn plain(limit: f64) -> String {
+    let text = format!("{limit:.4}");
+    text.trim_end_matches('0').trim_end_matches('.').to_owned()
 }
 
 fn unit(direction: [f64; 3]) -> [f64; 3] {
