@@ -14,16 +14,29 @@ use crate::report::ReportArguments;
 const EXAMPLES: &str = "\
 Examples:
   delmpc                                        run the main scenario
+  delmpc run --view                             watch it in a browser and pull at the robot
   delmpc run --set seed=7 --set push.impulse_ns=20
   delmpc run configs/scenarios/atlas_one_foot.toml --set clock=lockstep --json
   delmpc model configs/robots/atlas.urdf
   delmpc push-map --controller mpc,static-lqr --directions 8
   delmpc replay runs/latest --verify
-  delmpc report runs/latest && xdg-open runs/latest/report.html
   delmpc help run                               everything about a subcommand
 
-Exit status: 0 success; 1 a success criterion was missed; 2 usage, configuration or model error; 3 fault (a process
-was lost, a link broke); 130 interrupted.";
+Files:
+  configs/scenarios/*.toml     scenarios: what happens, and what counts as success
+  configs/robots/NAME.urdf     robots, each with a companion table NAME.toml beside it
+  configs/examples/lamp        how to bring your own
+  runs/latest                  what the last run left behind
+
+Environment:
+  NO_COLOR                     no colours, even on a terminal
+
+Exit status:
+  0    success
+  1    a success criterion was missed
+  2    usage, configuration or model error
+  3    fault: a process was lost, a link broke, a file could not be written
+  130  interrupted";
 
 const RUN_EXAMPLES: &str = "\
 Examples:
@@ -31,8 +44,42 @@ Examples:
   delmpc run configs/scenarios/atlas_one_foot.toml --out /tmp/try
   delmpc run --set push.impulse_ns=20 --set push.direction=[1,0,0]
   delmpc run --view --set duration_s=60               watch, push with the mouse, pause
-  delmpc run --set clock=lockstep --one-process       the same bits every time
-  delmpc run runs/latest/scenario.toml                a run of yesterday again";
+  delmpc run --set clock=lockstep                     the same bits every time, as fast as it goes
+  delmpc run --json | jq .min_cop_margin_m            one figure
+  delmpc run runs/latest/scenario.toml                a run of yesterday again
+
+The folder of a run:
+  report.html                 the run to look at, in one file without network
+  plots/*.png                 its key plots
+  summary.json                every figure; flat keys, SI units
+  log.mcap                    every state, command and truth, for `delmpc replay` and viewers of MCAP
+  scenario.toml, robot.*      everything it takes to run it again
+  messages.txt                what the two processes said
+
+A scenario key is overridden by its full name, with a value as in TOML: --set reach.ball_m=[0.7,0.2,0.6]. \
+An unknown key or a value out of range is refused, with the nearest one allowed.";
+
+const PUSH_MAP_EXAMPLES: &str = "\
+Examples:
+  delmpc push-map                                        main scenario, 8 directions
+  delmpc push-map --controller mpc,static-lqr            against a fixed LQR
+  delmpc push-map --link utorso,pelvis --directions 16 --seeds 3
+  delmpc push-map configs/examples/lamp/reach.toml --link upper_arm --json
+  delmpc push-map --set sensors.noise_scale=5 --out /tmp/noisy
+
+A push is survived when the robot does not fall, keeps its other foot in the air and comes to rest. \
+Beside each limit stands the capture limit: what an inverted pendulum with a massless leg survives in that direction.";
+
+const REPLAY_EXAMPLES: &str = "\
+Examples:
+  delmpc run --set clock=lockstep && delmpc replay --verify
+  delmpc replay /tmp/try --verify";
+
+const REPORT_EXAMPLES: &str = "\
+Examples:
+  delmpc report                                 of the last run
+  xdg-open \"$(delmpc report /tmp/try)\"
+  for run in runs/*/; do delmpc report \"$run\"; done";
 
 const PART_EXAMPLES: &str = "\
 Examples:
@@ -91,21 +138,27 @@ pub enum Command {
     Controller(PartArguments),
     /// Check a robot model; print its table, draw it or, with --at, compute everything from it
     ///
-    /// The table shows the tree with joints, limits and masses, the names of the companion table, and what was accepted but should
-    /// be known.
+    /// The table shows the tree with joints, limits and masses, the names of the companion table, how the robot stands in each of its
+    /// postures, and what was accepted but should be known.
     #[command(after_long_help = MODEL_EXAMPLES)]
     Model(ModelArguments),
     /// Find the largest push survived in every direction: table, JSON, polar plot
+    ///
+    /// The robot stands in the scenario's posture and is pushed once, in lockstep; the impulse is found by bisection. Left behind are
+    /// push_map.json and push_map.svg.
+    #[command(after_long_help = PUSH_MAP_EXAMPLES)]
     PushMap(PushMapArguments),
     /// Run again from the log of a run and compare bit by bit
     ///
     /// The plant is given every logged command where it came; each state and truth must come out as logged. In lockstep the
     /// controller is given every logged state, and each command must come out as logged.
+    #[command(after_long_help = REPLAY_EXAMPLES)]
     Replay(ReplayArguments),
     /// Make report.html and the plots of a run again from its files
     ///
     /// The page is one file and needs no network: an animation of the robot, plots with one cursor, the criteria of the scenario.
     /// The key plots are left as PNG in the folder plots/ beside it. Prints the path of the page.
+    #[command(after_long_help = REPORT_EXAMPLES)]
     Report(ReportArguments),
     /// Print the script that makes a shell complete our words
     #[command(after_long_help = COMPLETIONS_EXAMPLES)]

@@ -25,6 +25,12 @@ pub fn controller(arguments: &PartArguments, allocations: fn() -> u64) -> Result
     let scenario = &setup.scenario;
     let run = run_id(arguments, &setup)?;
     let mut controller = RobotController::new(&setup)?;
+    let allowed_m = scenario.success.hand_error_at_deadline_m;
+    if let Some(distance_m) = controller.out_of_reach_m().filter(|distance_m| *distance_m > allowed_m) {
+        say(&format!(
+            "warning: no balanced posture brings the hand nearer to the ball than {distance_m:.3} m: move `reach.ball_m`"
+        ));
+    }
     prepare_machine(Role::Controller, scenario);
 
     let hash = setup.joint_set_hash();

@@ -15,7 +15,7 @@ use nalgebra::{Vector2, Vector3};
 use crate::report::scene::shapes;
 
 /// Largest edge of a piece of a box (m).
-const PIECE_M: f64 = 0.16;
+const PIECE_M: f64 = 0.08;
 /// Segments of a round shape.
 const SEGMENTS: usize = 20;
 /// From where it is seen: angles from the front to the left, and up (rad).
@@ -26,6 +26,8 @@ const HEIGHT: f64 = 300.0;
 const ROOM: f64 = 36.0;
 const CAPTION: f64 = 34.0;
 const TITLE: f64 = 58.0;
+/// Least width of the drawing, for its title (pixels).
+const WIDTH: f64 = 380.0;
 /// Most postures in a row.
 const COLUMNS: usize = 4;
 const DEFAULT_COLOUR: [f64; 3] = [0.42, 0.48, 0.55];
@@ -84,10 +86,13 @@ pub fn drawing(robot: &RobotModel) -> Result<String, ModelError> {
     let largest =
         bounds.iter().fold(Vector2::new(0.1, 0.1), |size: Vector2<f64>, bounds| size.sup(&bounds.size()));
     let scale = HEIGHT / largest.y.max(0.5 * largest.x);
-    let cell = Vector2::new(largest.x * scale + 2.0 * ROOM, largest.y * scale + ROOM + CAPTION);
     let columns = figures.len().min(COLUMNS);
     let rows = figures.len().div_ceil(columns);
-    let (width, height) = ((columns as f64 * cell.x).max(420.0), TITLE + rows as f64 * cell.y);
+    let cell = Vector2::new(
+        (largest.x * scale + 2.0 * ROOM).max(WIDTH / columns as f64),
+        largest.y * scale + ROOM + CAPTION,
+    );
+    let (width, height) = (columns as f64 * cell.x, TITLE + rows as f64 * cell.y);
 
     let mut text = format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width:.0} {height:.0}\" \

@@ -15,7 +15,9 @@
 //! | [`plant_process`] | the loop of the plant process |
 //! | [`one_process`] | both loops in one process |
 //! | [`truth`], [`observer`], [`metrics`], [`sole`] | what happened, and the figures made of it |
-//! | [`summary`] | all figures, success, the table a person reads |
+//! | [`summary`], [`summary_table`] | all figures and success; the same as a person reads them |
+//! | [`colour`] | colours on a terminal |
+//! | [`stance`] | how a robot stands in its postures, for the table of `delmpc model` |
 //! | [`drawing`] | a robot in its postures as SVG |
 //! | [`completions`] | what a shell needs to complete our words |
 //! | [`log`], [`log_viewer`] | the log of states, commands and truth, and what shows the robot to viewers of logs |
@@ -25,6 +27,7 @@
 //! | [`status_line`] | one line about the running run |
 
 pub mod cli;
+pub mod colour;
 pub mod completions;
 pub mod controller;
 pub mod drawing;
@@ -46,9 +49,11 @@ pub mod run_folder;
 pub mod setup;
 pub mod simulated_robot;
 pub mod sole;
+pub mod stance;
 pub mod status_line;
 pub mod steering;
 pub mod summary;
+pub mod summary_table;
 pub mod supervisor;
 pub mod truth;
 pub mod verdict;

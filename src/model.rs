@@ -18,6 +18,7 @@ use nalgebra::{DMatrix, DVector, Quaternion, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::drawing::drawing;
+use crate::stance::stances;
 use crate::verdict::{Ended, Failure};
 
 /// Arguments of `delmpc model`.
@@ -55,7 +56,7 @@ pub fn model(arguments: &ModelArguments) -> Result<Ended, Failure> {
         }
         None => {
             let robot = load_robot(arguments, arguments.base.as_deref(), None)?;
-            print!("{}", table(&robot));
+            print!("{}", table(&robot)?);
             if let Some(file) = &arguments.svg {
                 let svg = drawing(&robot).map_err(Failure::input)?;
                 std::fs::write(file, svg)
@@ -401,8 +402,8 @@ fn rows(matrix: &DMatrix<f64>) -> Vec<Vec<f64>> {
     matrix.row_iter().map(|row| row.iter().copied().collect()).collect()
 }
 
-/// A model as a person reads it: the tree with its joints, limits and masses, then names, then warnings.
-fn table(robot: &RobotModel) -> String {
+/// A model as a person reads it: the tree with its joints, limits and masses, then names, how it stands, warnings.
+fn table(robot: &RobotModel) -> Result<String, Failure> {
     let tree = &robot.tree;
     let mut text = String::new();
     let base = if tree.is_floating() { "floating base" } else { "fixed base" };
@@ -474,13 +475,18 @@ fn table(robot: &RobotModel) -> String {
     let contacts: Vec<&str> = robot.contacts.iter().map(|contact| contact.name.as_str()).collect();
     let _ = writeln!(text, "\nsoles:           {}\nframes:          {}", list(soles), list(frames));
     let _ = writeln!(text, "contact points:  {}\npostures:        {}", list(contacts), list(postures));
-    if robot.warnings.is_empty() {
+    let (stances, stance_warnings) = stances(robot).map_err(Failure::input)?;
+    if !stances.is_empty() {
+        let _ = write!(text, "\n{stances}");
+    }
+    text.push('\n');
+    if robot.warnings.is_empty() && stance_warnings.is_empty() {
         let _ = writeln!(text, "no warnings");
     }
-    for warning in &robot.warnings {
+    for warning in robot.warnings.iter().chain(&stance_warnings) {
         let _ = writeln!(text, "warning: {warning}");
     }
-    text
+    Ok(text)
 }
 
 /// What stands before the name of each body to draw the tree.

@@ -11,6 +11,7 @@ use delmpc_controller_process::controller_loop::Controller;
 use delmpc_messages::{Command, PlantState};
 use delmpc_robots::RobotModel;
 use delmpc_scenario::{Clock, ControllerKind, Scenario};
+use nalgebra::Vector3;
 
 use crate::setup::Setup;
 use crate::verdict::Failure;
@@ -44,6 +45,12 @@ impl RobotController {
             core::Controller::new(model, config(&setup.scenario)).map_err(|error| refused(&error))?;
         controller.set_origin_ns(0);
         Ok(Self { controller, realtime: setup.scenario.clock == Clock::Realtime })
+    }
+
+    /// How far from the ball the hand is in the posture in which the reach ends, m: not 0 when the ball cannot be reached in balance.
+    pub fn out_of_reach_m(&self) -> Option<f64> {
+        let (reach, goal) = self.controller.reference().reach.as_ref()?;
+        Some((goal.hand - Vector3::from(reach.ball_m)).norm())
     }
 
     /// The controller itself: its plan, its model, its problem.

@@ -10,11 +10,13 @@ use delmpc_transport::{RunId, remove_dead_runs};
 use serde::de::DeserializeOwned;
 
 use crate::cli::{RunArguments, RunOptions};
+use crate::colour::Colour;
 use crate::one_process::run_in_one_process;
 use crate::run_folder::{CONTROLLER_PART, PLANT_PART, RunFolder};
 use crate::setup::{Setup, scenario_file};
 use crate::status_line::StatusLine;
-use crate::summary::{Summary, table};
+use crate::summary::Summary;
+use crate::summary_table::summary_table;
 use crate::supervisor::{Course, Supervision};
 use crate::verdict::{Ended, Failure};
 use crate::view::View;
@@ -69,18 +71,22 @@ pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
     if let Some(view) = view {
         view.finish(summary.success, summary.failure.as_deref());
     }
+    let mut report = None;
     if !options.no_report {
         // A run is not worse because it cannot be drawn.
-        if let (Err(failure), false) = (crate::report::write(folder.path()), options.quiet) {
-            eprintln!("warning: no report: {failure}");
+        match crate::report::write(folder.path()) {
+            Ok(page) => report = Some(page),
+            Err(failure) if options.quiet => drop(failure),
+            Err(failure) => eprintln!("warning: no report: {failure}"),
         }
     }
 
     if options.json {
         println!("{}", summary.to_json());
     } else if talkative {
-        print!("{}", table(&summary, scenario));
-        println!("{}", folder.path().display());
+        let feet = setup.robot.soles.len();
+        print!("{}", summary_table(&summary, scenario, feet, Colour::of(&std::io::stdout())));
+        println!("{}", report.as_deref().unwrap_or(folder.path()).display());
     }
     match (course, summary.failure) {
         (Course::Interrupted, _) => Ok(Ended::Interrupted),
@@ -129,7 +135,8 @@ fn run_in_two_processes(
             watch.look();
         }
         if let Some(text) = line.as_mut().and_then(StatusLine::look) {
-            let _ = write!(std::io::stderr(), "\r\x1b[K{text}");
+            // Cut off where the terminal ends: what wraps could not be overwritten.
+            let _ = write!(std::io::stderr(), "\r\x1b[K\x1b[?7l{text}\x1b[?7h");
         }
     });
     if show {

@@ -85,6 +85,9 @@ impl Setup {
         if joints > MAX_JOINTS {
             return Err(format!("`robot.urdf`: {joints} joints, but a message has room for {MAX_JOINTS}"));
         }
+        if let Some(why) = crate::stance::undriven(robot).into_iter().next() {
+            return Err(format!("`robot.urdf`: {why}"));
+        }
         let soles = robot.soles.iter().map(|sole| sole.name.as_str());
         one_of("robot.stance", "sole", &scenario.robot.stance, soles)?;
         let postures = robot.postures.iter().map(|posture| posture.name.as_str());

@@ -25,6 +25,8 @@ use crate::verdict::Failure;
 const WATCHDOG_FREQUENCY: f64 = 12.0;
 /// ... and this damping ratio, carrying the inertia it has in the posture.
 const WATCHDOG_DAMPING_RATIO: f64 = 0.7;
+/// The robot has fallen when its base is lower than this part of the height at which it began.
+const FALL_HEIGHT: f64 = 0.45;
 
 /// The simulation, and what it takes to tell the truth about it.
 #[derive(Debug)]
@@ -55,7 +57,7 @@ impl SimulatedRobot {
 
         let holding = Holding::new(setup).map_err(|error| refused(&error))?;
         let model = model(setup)?;
-        let config = config(setup, &holding)?;
+        let config = config(setup, &holding, FALL_HEIGHT * base_pose.translation.z)?;
         let mut plant = simulation::Plant::new(&model, &config, &state).map_err(|error| refused(&error))?;
         plant.preset_torque(&holding.torque).map_err(|error| refused(&error))?;
         let clock = match scenario.clock {
@@ -202,7 +204,7 @@ fn model(setup: &Setup) -> Result<PlantModel, Failure> {
     })
 }
 
-fn config(setup: &Setup, holding: &Holding) -> Result<PlantConfig, Failure> {
+fn config(setup: &Setup, holding: &Holding, min_base_height: f64) -> Result<PlantConfig, Failure> {
     let Setup { robot, scenario, .. } = setup;
     let plant = &scenario.plant;
     let limits = robot.limits.iter().map(|limit| match plant.torque_limits {
@@ -230,7 +232,11 @@ fn config(setup: &Setup, holding: &Holding) -> Result<PlantConfig, Failure> {
             damping: holding.damping.clone(),
             ..WatchdogConfig::default()
         },
-        monitor: MonitorConfig { stance_foot: stance.unwrap_or(0), ..MonitorConfig::default() },
+        monitor: MonitorConfig {
+            stance_foot: stance.unwrap_or(0),
+            min_base_height,
+            ..MonitorConfig::default()
+        },
         seed: scenario.seed,
         ..PlantConfig::default()
     })

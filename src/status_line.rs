@@ -5,6 +5,7 @@ use delmpc_messages::{Command, FallbackLevel, PlantState, Verdict};
 use delmpc_transport::{Channel, RunId, RunNode, SharedSubscriber, Subscriber};
 use nalgebra::Vector2;
 
+use crate::colour::Colour;
 use crate::setup::Setup;
 use crate::sole::{cop_margin_m, pressure_point};
 
@@ -20,6 +21,7 @@ pub struct StatusLine {
     period_s: f64,
     state: Option<Box<PlantState>>,
     command: Option<Box<Command>>,
+    colour: Colour,
     next_ns: u64,
 }
 
@@ -46,6 +48,7 @@ impl StatusLine {
             period_s: 1.0 / setup.scenario.controller.mpc_rate_hz,
             state: None,
             command: None,
+            colour: Colour::of(&std::io::stderr()),
             next_ns: 0,
         }
     }
@@ -70,14 +73,22 @@ impl StatusLine {
         let margin = pressure_point(&state.stance_torque_b, &state.stance_force_b)
             .map(|point| cop_margin_m(&self.polygon, &point))
             .map_or("in the air".to_owned(), |margin| format!("{:+5.1} mm", 1e3 * margin));
+        // The level is said when there is something to say.
+        let said = format!("{} {}", verdict(command.verdict()), level(command.fallback_level()));
+        let said = format!("{:<18}", said.trim_end());
+        let well = command.verdict() == Some(Verdict::Ok)
+            && command.fallback_level() == Some(FallbackLevel::FreshSolution);
+        // In lockstep a cycle takes the time it takes.
+        let cycle_ms = command.report.total_ns as f64 * 1e-6;
+        let cycle = match command.report.total_ns {
+            0 => String::new(),
+            _ => format!("cycle {cycle_ms:5.2} of {:.2} ms   ", 1e3 * self.period_s),
+        };
         Some(format!(
-            "{:6.2} / {:.0} s   cycle {:5.2} of {:.2} ms   {:<14}  {:<14}  pressure point to edge {margin}",
+            "{:6.2} / {:.0} s   {cycle}pressure point to edge {margin}   {}",
             state.time_ns as f64 * 1e-9,
             self.duration_s,
-            command.report.total_ns as f64 * 1e-6,
-            1e3 * self.period_s,
-            verdict(command.verdict()),
-            level(command.fallback_level()),
+            if well { self.colour.good(&said) } else { self.colour.bad(&said) },
         ))
     }
 }

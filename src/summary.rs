@@ -1,6 +1,5 @@
-//! `summary.json`: the figures of a run, its success, and how a person reads them.
+//! `summary.json`: the figures of a run and its success.
 
-use std::fmt::Write as _;
 use std::path::Path;
 
 use delmpc_scenario::{Clock, Scenario};
@@ -189,11 +188,11 @@ fn missed_criterion(scenario: &Scenario, plant: &PlantPart) -> Option<String> {
     let realtime = scenario.clock == Clock::Realtime;
     let at_most = |key: &str, value: Option<f64>, most: f64| {
         let value = value.filter(|value| value.is_nan() || *value > most)?;
-        Some(format!("{key} = {value:.4}, allowed is at most {most}"))
+        Some(format!("{key} = {value:.4}, allowed is at most {}", plain(most)))
     };
     let at_least = |key: &str, value: Option<f64>, least: f64| {
         let value = value.filter(|value| value.is_nan() || *value < least)?;
-        Some(format!("{key} = {value:.4}, needed is at least {least}"))
+        Some(format!("{key} = {value:.4}, needed is at least {}", plain(least)))
     };
     at_most("hand_error_at_deadline_m", robot.hand_error_at_deadline_m, limit.hand_error_at_deadline_m)
         .or_else(|| {
@@ -216,83 +215,13 @@ fn missed_criterion(scenario: &Scenario, plant: &PlantPart) -> Option<String> {
         })
 }
 
+/// A limit as somebody would write it: no more digits than are compared.
+fn plain(limit: f64) -> String {
+    let text = format!("{limit:.4}");
+    text.trim_end_matches('0').trim_end_matches('.').to_owned()
+}
+
 fn unit(direction: [f64; 3]) -> [f64; 3] {
     let length = direction.iter().map(|x| x * x).sum::<f64>().sqrt();
     direction.map(|x| x / length)
-}
-
-/// The summary as a person reads it.
-pub fn table(summary: &Summary, scenario: &Scenario) -> String {
-    let mut text = String::new();
-    let verdict = match &summary.failure {
-        None => "success".to_owned(),
-        Some(failure) => format!("FAILED: {failure}"),
-    };
-    let _ = writeln!(text, "{} (seed {}): {verdict}", summary.scenario, summary.seed);
-    let limit = &scenario.success;
-    let mut line = |what: &str, value: Option<String>, allowed: Option<String>| {
-        let value = value.unwrap_or_else(|| "-".to_owned());
-        let _ = match allowed {
-            Some(allowed) => writeln!(text, "  {what:<34} {value:>12}   {allowed}"),
-            None => writeln!(text, "  {what:<34} {value:>12}"),
-        };
-    };
-    let millimetres = |value: f64| format!("{:.1} mm", 1e3 * value);
-    let milliseconds = |value: f64| format!("{:.3} ms", 1e3 * value);
-    if let Some(PlantPart { robot, .. }) = &summary.plant {
-        line("simulated time", Some(format!("{:.2} s", robot.duration_s)), None);
-        let fall = robot.fall_time_s.map_or("no".to_owned(), |time| format!("at {time:.2} s"));
-        line("fall", Some(fall), None);
-        let allowed = |most: f64| Some(format!("at most {}", millimetres(most)));
-        if scenario.reach.is_some() {
-            let (deadline, hold) = (robot.hand_error_at_deadline_m, robot.hand_error_hold_max_m);
-            line(
-                "hand to ball at the deadline",
-                deadline.map(millimetres),
-                allowed(limit.hand_error_at_deadline_m),
-            );
-            line("hand to ball while holding", hold.map(millimetres), allowed(limit.hand_error_hold_max_m));
-        }
-        line("stance slip", Some(millimetres(robot.max_stance_slip_m)), allowed(limit.max_stance_slip_m));
-        let degrees = |radians: f64| format!("{:.3} deg", radians.to_degrees());
-        let tilt = format!("at most {}", degrees(limit.max_stance_tilt_rad));
-        line("stance tilt", Some(degrees(robot.max_stance_tilt_rad)), Some(tilt));
-        let margin = format!("at least {}", millimetres(limit.min_cop_margin_m));
-        line("pressure point to edge of sole", robot.min_cop_margin_m.map(millimetres), Some(margin));
-        line("friction used", robot.max_friction_use.map(|part| format!("{:.0} %", 100.0 * part)), None);
-        let ratio = format!("at most {:.0} %", 100.0 * limit.max_torque_ratio);
-        line(
-            "largest torque of its limit",
-            Some(format!("{:.0} %", 100.0 * robot.max_torque_ratio)),
-            Some(ratio),
-        );
-        if robot.recovered.is_some() {
-            let settle = robot.settle_time_s.map(|time| format!("{time:.2} s"));
-            line("push to rest", settle, Some(format!("at most {} s", limit.settle_time_s)));
-        }
-    }
-    if let Some(part) = &summary.controller {
-        line("control cycles", Some(part.cycles.to_string()), None);
-        let period = Some(format!("period {}", milliseconds(summary.cycle_period_s)));
-        line("cycle time, median", part.cycle_time_p50_s.map(milliseconds), period);
-        line("state to command, median", part.feedback_p50_s.map(milliseconds), None);
-        line("cycle time, 99.9 %", part.cycle_time_p999_s.map(milliseconds), None);
-        line("deadlines missed", Some(part.deadline_misses.to_string()), None);
-        line("QP solves", Some(part.qp_solves.to_string()), None);
-        line(
-            "worst fallback level",
-            Some(part.fallback_level_max.to_string()),
-            Some("0: fresh solution".to_owned()),
-        );
-    }
-    if let Some(part) = &summary.plant {
-        line("state to command, median", part.state_to_command_age_p50_s.map(milliseconds), None);
-        line("plant step, median", part.plant_step_p50_s.map(milliseconds), None);
-        line(
-            "simulated over wall time",
-            part.plant_real_time_factor.map(|factor| format!("{factor:.3}")),
-            None,
-        );
-    }
-    text
 }

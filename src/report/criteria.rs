@@ -17,8 +17,8 @@ pub struct Criterion {
     pub met: Option<bool>,
 }
 
-/// All criteria that apply to a scenario, judged by the figures of `summary.json`.
-pub fn criteria(scenario: &Scenario, summary: &Value) -> Vec<Criterion> {
+/// All criteria that apply to a scenario and a robot with so many feet, judged by the figures of `summary.json`.
+pub fn criteria(scenario: &Scenario, feet: usize, summary: &Value) -> Vec<Criterion> {
     let limit = &scenario.success;
     let number = |key: &str| summary.get(key).and_then(Value::as_f64);
     let flag = |key: &str| summary.get(key).and_then(Value::as_bool);
@@ -38,7 +38,7 @@ pub fn criteria(scenario: &Scenario, summary: &Value) -> Vec<Criterion> {
             met: flag("fell").map(|fell| !fell),
         });
     }
-    if limit.no_touch_down {
+    if limit.no_touch_down && feet > 1 {
         let touched = flag("other_foot_touched");
         let value =
             touched.map_or_else(none, |touched| if touched { "touched" } else { "in the air" }.to_owned());
@@ -92,12 +92,13 @@ mod tests {
     fn criteria_say_what_was_reached_and_whether_it_is_enough() {
         let scenario = Scenario { clock: Clock::Lockstep, ..Scenario::default() };
         let summary = json!({"fell": false, "max_torque_ratio": 1.25, "max_stance_slip_m": 0.001});
-        let list = criteria(&scenario, &summary);
+        let list = criteria(&scenario, 1, &summary);
         let found = |name: &str| list.iter().find(|criterion| criterion.name == name).unwrap();
         assert_eq!((found("No fall").met, found("No fall").value.as_str()), (Some(true), "stood"));
         assert_eq!(found("Torque of its limit").met, Some(false));
         assert_eq!((found("Stance slip").met, found("Stance slip").value.as_str()), (Some(true), "1.0 mm"));
         assert_eq!(found("Pressure point to edge").met, None, "nothing was measured");
         assert!(list.iter().all(|criterion| criterion.name != "Push to rest"), "there is no push");
+        assert!(list.iter().all(|criterion| criterion.name != "Swing foot"), "there is no other foot");
     }
 }

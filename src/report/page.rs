@@ -35,7 +35,8 @@ pub fn page(setup: &Setup, recording: &Recording, summary: &Value) -> Result<Str
         let success = summary.get("success").and_then(Value::as_bool);
         data.insert("outcome".to_owned(), json!({"success": success, "failure": failure}));
         data.insert("about".to_owned(), json!(recording.about));
-        data.insert("criteria".to_owned(), json!(criteria(&setup.scenario, summary)));
+        let list = criteria(&setup.scenario, setup.robot.soles.len(), summary);
+        data.insert("criteria".to_owned(), json!(list));
         data.insert("figures".to_owned(), summary.clone());
         data.insert("frame_s".to_owned(), json!(recording.frame_s));
         data.insert("frames".to_owned(), table(&recording.frames));

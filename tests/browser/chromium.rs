@@ -53,7 +53,12 @@ impl Browser {
     }
 
     /// Opens a page and waits until its script is through.
-    pub fn open(&mut self, url: &str, [width, height]: [u32; 2], mobile: bool) -> Page {
+    pub fn open(&mut self, url: &str, size: [u32; 2], mobile: bool) -> Page {
+        self.open_after("", url, size, mobile)
+    }
+
+    /// The same after a script of ours has run in the empty page.
+    pub fn open_after(&mut self, script: &str, url: &str, [width, height]: [u32; 2], mobile: bool) -> Page {
         let (socket, _) = tungstenite::connect(&self.address).unwrap();
         if let MaybeTlsStream::Plain(stream) = socket.get_ref() {
             stream.set_read_timeout(Some(PATIENCE)).unwrap();
@@ -67,6 +72,7 @@ impl Browser {
         }
         let metrics = json!({"width": width, "height": height, "deviceScaleFactor": 1, "mobile": mobile});
         page.send("Emulation.setDeviceMetricsOverride", &metrics);
+        page.send("Page.addScriptToEvaluateOnNewDocument", &json!({"source": script}));
         page.send("Page.navigate", &json!({"url": url}));
         page.wait_for("typeof page === 'object'");
         page

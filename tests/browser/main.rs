@@ -106,6 +106,51 @@ fn the_report_fits_a_phone_and_both_schemes() {
     std::fs::remove_dir_all(folder).unwrap();
 }
 
+/// A browser without WebGL, and a printer: both show the robot all the same.
+#[test]
+fn the_report_shows_the_robot_without_webgl_and_on_paper() {
+    let Some(mut browser) = Browser::start("the_report_shows_the_robot_without_webgl_and_on_paper") else {
+        return;
+    };
+    let folder = reported_run("painter");
+    let url = format!("file://{}", folder.join("report.html").display());
+    let without = "const real = HTMLCanvasElement.prototype.getContext; \
+        HTMLCanvasElement.prototype.getContext = function (kind, ...more) { \
+        return kind.startsWith('webgl') ? null : real.call(this, kind, ...more); }";
+    let mut page = browser.open_after(without, &url, [1400, 900], false);
+    assert_eq!(page.value("page.view.gl"), serde_json::Value::Null);
+
+    // The colours of the robot's right and left side and of the ball are in the picture.
+    page.value(
+        "globalThis.painted = (canvas) => { page.show(); \
+         const pixels = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data; \
+         const count = {orange: 0, blue: 0, yellow: 0}; \
+         for (let i = 0; i < pixels.length; i += 4) { const [r, g, b] = pixels.subarray(i, i + 3); \
+         if (r > 1.5 * b && r > 1.4 * g) count.orange++; else if (b > 1.4 * r) count.blue++; \
+         else if (r > 150 && g > 120 && b < 60) count.yellow++; } return count; }",
+    );
+    let assert_painted = |painted: &serde_json::Value| {
+        for colour in ["orange", "blue", "yellow"] {
+            assert!(painted[colour].as_u64().unwrap() > 100, "{painted}");
+        }
+    };
+    let first = page.value("painted(page.view.canvas)");
+    assert_painted(&first);
+    page.value("page.seek(0.45)");
+    assert_ne!(page.value("painted(page.view.canvas)"), first, "the robot does not move");
+    page.screenshot(&Path::new(TEMPORARY).join("report-painter.png"));
+
+    // On paper the animation is replaced by a still copy of it, and there is nothing to press.
+    page.send("Emulation.setEmulatedMedia", &json!({"media": "print"}));
+    page.value("dispatchEvent(new Event('beforeprint'))");
+    assert_painted(&page.value("painted($('print'))"));
+    assert_eq!(page.value("getComputedStyle($('print')).display"), "block");
+    assert_eq!(page.value("getComputedStyle($('transport')).display"), "none");
+    page.screenshot(&Path::new(TEMPORARY).join("report-print.png"));
+    assert_no_problems(&mut page);
+    std::fs::remove_dir_all(folder).unwrap();
+}
+
 /// A run with a live page, and the page's address.
 struct LiveRun {
     child: Child,
@@ -154,7 +199,7 @@ fn a_person_pulls_at_the_running_robot_and_pauses() {
     let torso = "run.robot.bodies.findIndex((body) => body.name === 'utorso')";
     let place = format!(
         "(() => {{ const box = $('view').getBoundingClientRect(), body = {torso}; \
-         const [x, y] = page.view.project(moved(page.motion.poses[body], [0, 0, 0.65])); \
+         const [x, y] = page.view.project(moved(page.motion.poses[body], [-0.2, 0, 0.7])); \
          return [x + box.left, y + box.top]; }})()"
     );
     let place = page.value(&place);

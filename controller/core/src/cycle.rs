@@ -323,7 +323,9 @@ impl Controller {
         self.last_sequence = state.header.sequence;
 
         let measured = Vector3::from(state.stance_force_b);
-        let change = self.planned_force.map_or(Vector3::zeros(), |planned| measured - planned);
+        // A force of zero is one that is not measured.
+        let planned = self.planned_force.filter(|_| measured != Vector3::zeros());
+        let change = planned.map_or(Vector3::zeros(), |planned| measured - planned);
         self.force_change += FORCE_SMOOTHING * (change - self.force_change);
 
         let measured_s = self.run_time_s(state.time_ns);

@@ -64,6 +64,20 @@ pub struct ControllerModel {
 }
 
 impl ControllerModel {
+    /// A robot that stands in a posture, and whose messages have the joints in the order of the tree. Nothing reaches, no other foot
+    /// is watched, and the stance foot is taken to be where it was: fill in the fields for more.
+    pub fn standing(
+        tree: KinematicTree,
+        joint_set_hash: u64,
+        limits: Vec<JointLimits>,
+        sole: Vec<[f64; 2]>,
+        posture: Vec<f64>,
+    ) -> Self {
+        let message_joint = (0..tree.dof()).collect();
+        let (hand, swing_foot, stance) = (None, None, None);
+        Self { tree, message_joint, joint_set_hash, limits, sole, hand, swing_foot, posture, stance }
+    }
+
     /// Message indices of the joints of a re-rooted tree.
     pub fn message_joints(rerooted: &Rerooted) -> Vec<usize> {
         rerooted.old_joint_bodies().iter().map(|body| body - 1).collect()

@@ -16,7 +16,7 @@ use crate::{
 /// | `position`, `velocity` | joints, in the order of the joint set | rad or m, per s | joint |
 /// | `base_position_w`, `base_orientation_w` | origin and axes of the base link frame (the root link, the pelvis of Atlas) | m, 1 | world |
 /// | `base_angular_velocity_b`, `base_linear_velocity_b` | velocity of the base link frame and of its origin | rad/s, m/s | base link |
-/// | `stance_torque_b`, `stance_force_b` | wrench of the ground *on* the stance foot, torque about the sole frame's origin | N m, N | sole |
+/// | `stance_torque_b`, `stance_force_b` | wrench of the ground *on* the stance foot, torque about the sole frame's origin; force zero: not measured | N m, N | sole |
 /// | `applied_torque` | torque the actuators gave during the step before `time_ns` | N m or N | joint |
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]

@@ -43,7 +43,7 @@ class Page {
       high = Math.max(high, pose[11] + 0.5 * Math.max(...shape.size));
     }
     this.view.camera.target = [motion.com[0] + 0.05 * high, motion.com[1], 0.47 * high];
-    this.view.camera.distance = 1.85 * high;
+    this.view.camera.distance = 2.05 * high;
   }
 
   moveCamera(button) {
@@ -83,9 +83,10 @@ class Page {
     $("figures").replaceChildren(...Object.entries(figures ?? {}).map(([key, value]) =>
       element("tr", {}, element("th", { scope: "row" }, key), element("td", {}, value === null ? "–" : Array.isArray(value) ? value.map(short).join(", ") : typeof value === "number" ? (Number.isInteger(value) ? String(value) : clean(value.toPrecision(5))) : String(value)))));
     $("configuration").textContent = about.configuration ?? "";
+    const size = signSize(run.robot.mass_kg);
     const notes = [
       `Frames every ${(1e3 * (run.frame_s ?? 0.01)).toFixed(0)} ms; torques, hand distance and the shaded band of the pressure point are the extremes between frames.`,
-      "Arrows: ground reaction 0.6 m for the robot's weight, push 0.4 m for 150 N. Dashed lines inside the sole: the margin the controller keeps.",
+      `Arrows: ground reaction ${(REACTION * size).toFixed(2)} m for the robot's weight, push ${(0.1 * PUSH * size).toFixed(2)} m for a tenth of it. Dashed lines inside the sole: the margin the controller keeps.`,
       run.damage ? `The log ends early: ${run.damage}` : null,
     ];
     $("notes").replaceChildren(...notes.filter(Boolean).map((note) => element("li", {}, note)));

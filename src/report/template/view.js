@@ -285,6 +285,9 @@ class View {
       }
     }
     triangles.sort((x, y) => y.depth - x.depth);
+    // Wide enough to close the seams between two triangles.
+    paper.lineWidth = 1;
+    paper.lineJoin = "round";
     for (const { a, b, c, style } of triangles) {
       paper.fillStyle = paper.strokeStyle = style;
       paper.beginPath();
@@ -309,6 +312,10 @@ function poseAlong(origin, direction) {
 
 const mixed = (a, b, part) => a.map((x, i) => x + part * (b[i] - x));
 
+// Lengths of arrows for a force like the robot's weight (m), for a robot of 175 kg; lighter ones have smaller signs.
+const REACTION = 0.6, PUSH = 4.6;
+const signSize = (mass_kg) => Math.max(0.3, Math.min(1, Math.cbrt(mass_kg / 175)));
+
 // The things that are drawn at a moment.
 class Actors {
   constructor(robot) {
@@ -318,8 +325,10 @@ class Actors {
     this.cone = coneMesh();
     this.disc = discMesh();
     this.ring = ringMesh();
-    this.ball = sphereMesh([0.035]);
-    this.bead = sphereMesh([0.016]);
+    this.ball = sphereMesh([0.04]);
+    // Small robots have small signs.
+    const size = (this.size = signSize(robot.mass_kg));
+    this.bead = sphereMesh([0.016 * size]);
     this.outlines = robot.soles.map((sole) => outlineMesh(sole.polygon, 0.012));
   }
 
@@ -335,7 +344,7 @@ class Actors {
   }
 
   at(motion, colours) {
-    const { robot } = this, weight = robot.mass_kg * run.gravity;
+    const { robot, size } = this, weight = robot.mass_kg * run.gravity;
     const items = this.shapes.map(({ shape, mesh }) => ({
       mesh,
       pose: poseOf(motion.poses, shape),
@@ -348,24 +357,24 @@ class Actors {
     if (sole) {
       const lifted = compose(motion.sole, [...level, 0, 0, 0.001]);
       items.push({ mesh: this.outlines[run.stance], pose: lifted, colour: colours.sole, flat: true });
-      items.push(flat(motion.com[0], motion.com[1], 0.003, this.ring, 0.022, colours.com));
-      items.push(flat(motion.capture[0], motion.capture[1], 0.004, this.disc, 0.013, colours.capture));
+      items.push(flat(motion.com[0], motion.com[1], 0.003, this.ring, 0.022 * size, colours.com));
+      items.push(flat(motion.capture[0], motion.capture[1], 0.004, this.disc, 0.013 * size, colours.capture));
       if (Number.isFinite(motion.pressure[0])) {
         const foot = moved(motion.sole, [motion.pressure[0], motion.pressure[1], 0]);
-        const force = turned(motion.sole, motion.force).map((x) => (0.6 * x) / weight);
-        items.push(flat(foot[0], foot[1], Math.max(0, foot[2]) + 0.005, this.disc, 0.013, colours.pressure));
-        items.push(...this.arrow([foot[0], foot[1], Math.max(0, foot[2])], force, 0.008, colours.pressure));
+        const force = turned(motion.sole, motion.force).map((x) => (REACTION * size * x) / weight);
+        items.push(flat(foot[0], foot[1], Math.max(0, foot[2]) + 0.005, this.disc, 0.013 * size, colours.pressure));
+        items.push(...this.arrow([foot[0], foot[1], Math.max(0, foot[2])], force, 0.008 * size, colours.pressure));
       }
     }
     items.push({ mesh: this.bead, pose: [...level, ...motion.com], colour: colours.com, through: true });
     if (run.ball) items.push({ mesh: this.ball, pose: [...level, ...run.ball], colour: colours.ball, shadow: true });
     const push = Math.hypot(...motion.push);
     if (push > 0) {
-      // Ends where it acts; 0.4 m for 150 N, but never lost nor endless.
+      // Ends where it acts; never lost nor endless.
       const at = motion.pushed ?? this.pushedPoint(motion);
-      const length = Math.max(0.18, Math.min(0.9, (0.4 * push) / 150));
+      const length = size * Math.max(0.18, Math.min(0.9, (PUSH * push) / weight));
       const arrow = motion.push.map((x) => (x / push) * length);
-      items.push(...this.arrow(at.map((x, i) => x - arrow[i]), arrow, 0.014, colours.push));
+      items.push(...this.arrow(at.map((x, i) => x - arrow[i]), arrow, 0.014 * size, colours.push));
     }
     return items;
   }
