@@ -218,6 +218,7 @@ fn config(setup: &Setup, holding: &Holding, min_base_height: f64) -> Result<Plan
         errors: ModelErrors {
             mass_scale: plant.mass_scale,
             inertia_scale: plant.inertia_scale,
+            com_shift: plant.com_shift_m.into(),
             ..ModelErrors::default()
         },
         actuators: ActuatorConfig {

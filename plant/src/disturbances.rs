@@ -73,13 +73,22 @@ pub struct ModelErrors {
     pub inertia_scale: f64,
     /// Further factors on mass and inertia of single bodies: (body, factor).
     pub body_mass_scale: Vec<(usize, f64)>,
+    /// Shift of every body's mass centre, in its link frame, m. The link frames of a robot at zero angles are parallel as a rule: then
+    /// the mass centre of the whole robot shifts by this, while it is near that posture.
+    pub com_shift: Vector3<f64>,
     /// Factor on all friction coefficients.
     pub friction_scale: f64,
 }
 
 impl Default for ModelErrors {
     fn default() -> Self {
-        Self { mass_scale: 1.0, inertia_scale: 1.0, body_mass_scale: Vec::new(), friction_scale: 1.0 }
+        Self {
+            mass_scale: 1.0,
+            inertia_scale: 1.0,
+            body_mass_scale: Vec::new(),
+            com_shift: Vector3::zeros(),
+            friction_scale: 1.0,
+        }
     }
 }
 
@@ -94,7 +103,9 @@ impl ModelErrors {
         require(positive(self.inertia_scale), "inertia factor", self.inertia_scale, "positive")?;
         let friction = self.friction_scale;
         require(friction.is_finite() && friction >= 0.0, "friction factor", friction, "not negative")?;
-        if self.mass_scale == 1.0 && self.inertia_scale == 1.0 && self.body_mass_scale.is_empty() {
+        let shift = self.com_shift;
+        require(shift.iter().all(|x| x.is_finite()), "shift of the mass centres", shift.amax(), "finite")?;
+        if *self == (Self { friction_scale: friction, ..Self::default() }) {
             return Ok(tree.clone());
         }
         if !tree.is_floating() {
@@ -114,6 +125,7 @@ impl ModelErrors {
         let mut bodies = tree.bodies().iter().zip(&factors).map(|(body, factor)| {
             let mut body = *body;
             body.inertia.mass *= factor;
+            body.inertia.com += shift;
             body.inertia.inertia *= factor * self.inertia_scale;
             body
         });

@@ -30,7 +30,7 @@ use crate::dual_qp::QpSolver;
 use crate::errors::ControlError;
 use crate::estimator::{Estimate, Estimator};
 use crate::fallback::{Attempt, FallbackLadder, Situation};
-use crate::feedback_law::{Law, bound_by_pressure_point, write_law};
+use crate::feedback_law::{Law, LawHistory, bound_by_pressure_point, write_law};
 use crate::horizon_problem::HorizonProblem;
 use crate::kernels::all_finite;
 use crate::lq_problem::LqProblem;
@@ -122,8 +122,9 @@ pub struct Controller {
     force_change: Vector3<f64>,
 
     static_law: Law,
-    /// The law in the last command.
+    /// The law in the last command, and those before.
     law: Law,
+    past_laws: LawHistory,
     command: Command,
     blank_report: CycleReport,
 
@@ -201,6 +202,7 @@ impl Controller {
             force_change: Vector3::zeros(),
             static_law: Law::new(n),
             law: Law::new(n),
+            past_laws: LawHistory::new(n, config.delay_s, config.period_s),
             blank_report: command.report,
             command,
             origin_ns: None,
@@ -341,14 +343,15 @@ impl Controller {
         {
             start_s = ahead_s;
         }
-        self.predict(start_s - measured_s).map_err(|()| reason::PREDICTION)?;
+        self.predict(measured_s, start_s - measured_s).map_err(|()| reason::PREDICTION)?;
         self.predicted_for_s = start_s;
         self.has_prediction = true;
         Ok(start_s)
     }
 
-    /// Moves `predicted` forward under the law of the last command, in the steps of the servo: its gains are too stiff for longer ones.
-    fn predict(&mut self, duration_s: f64) -> Result<(), ()> {
+    /// Moves `predicted` forward under the laws of the last commands, in the steps of the servo: their gains are too stiff for longer
+    /// ones.
+    fn predict(&mut self, measured_s: f64, duration_s: f64) -> Result<(), ()> {
         if duration_s <= 0.0 || self.command.state_sequence == 0 {
             return Ok(());
         }
@@ -361,7 +364,8 @@ impl Controller {
         self.dynamics.set_time_step(time_step).map_err(|_| ())?;
         self.dynamics.begin(tree, &self.predicted).map_err(|_| ())?;
         for step in 0..steps as usize {
-            self.law.torque_at(step as f64 * time_step, &self.predicted, error, torque);
+            let (elapsed_s, law) = self.past_laws.at(measured_s + step as f64 * time_step);
+            law.torque_at(elapsed_s, &self.predicted, error, torque);
             self.dynamics.advance(tree, torque, &mut self.predicted).map_err(|_| ())?;
         }
         if all_finite(&self.predicted) { Ok(()) } else { Err(()) }
@@ -483,6 +487,7 @@ impl Controller {
                 if level > self.ladder.level() {
                     self.ladder.descend_to(level);
                 }
+                self.past_laws.push(self.run_time_s(start_ns), &self.law);
                 return;
             }
         }
@@ -619,6 +624,16 @@ impl Controller {
     /// The LQ problem of the last cycle.
     pub fn problem(&self) -> &LqProblem {
         &self.horizon.problem
+    }
+
+    /// Deviations from the nominal that solve the problem of the last cycle.
+    pub fn solution(&self) -> &Trajectory {
+        &self.solution
+    }
+
+    /// The constrained solve of the last cycle: its active rows and multipliers.
+    pub fn constrained(&self) -> &ProjectedQp {
+        &self.qp
     }
 
     /// State `(q, q̇)` predicted for the time the last command takes effect.

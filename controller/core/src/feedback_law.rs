@@ -42,6 +42,16 @@ impl Law {
         Self { torque: vec![0.0; n], lower, upper, reference, acceleration, gain: Mat::zeros(n, 2 * n) }
     }
 
+    /// Copies a law of the same size.
+    pub fn copy_from(&mut self, other: &Self) {
+        self.torque.copy_from_slice(&other.torque);
+        self.lower.copy_from_slice(&other.lower);
+        self.upper.copy_from_slice(&other.upper);
+        self.reference.copy_from_slice(&other.reference);
+        self.acceleration.copy_from_slice(&other.acceleration);
+        self.gain.copy_from(&other.gain);
+    }
+
     /// The torque at the state `x`, `elapsed_s` after the law began.
     pub fn torque_at(&self, elapsed_s: f64, x: &[f64], error: &mut [f64], torque: &mut [f64]) {
         let n = self.torque.len();
@@ -58,6 +68,45 @@ impl Law {
         for ((u, lower), upper) in torque.iter_mut().zip(&self.lower).zip(&self.upper) {
             *u = u.max(*lower).min(*upper);
         }
+    }
+}
+
+/// The laws of the last commands: those that are in force between a measurement and the time the answer to it takes effect.
+#[derive(Clone, Debug)]
+pub(crate) struct LawHistory {
+    /// When each took effect, s of the run, and the law.
+    laws: Vec<(f64, Law)>,
+    latest: usize,
+}
+
+impl LawHistory {
+    /// Of `n` joints, for answers that take `delay_s` where a new law comes every `period_s`.
+    pub fn new(n: usize, delay_s: f64, period_s: f64) -> Self {
+        let count = libm::ceil(delay_s / period_s).clamp(0.0, 64.0) as usize + 2;
+        Self { laws: vec![(f64::INFINITY, Law::new(n)); count], latest: 0 }
+    }
+
+    /// Takes a law in, in place of the oldest one.
+    pub fn push(&mut self, from_s: f64, law: &Law) {
+        self.latest = (self.latest + 1) % self.laws.len();
+        let (from, stored) = &mut self.laws[self.latest];
+        *from = from_s;
+        stored.copy_from(law);
+    }
+
+    /// The law in force at a time, and how long it has been; before all of them the oldest one.
+    pub fn at(&self, time_s: f64) -> (f64, &Law) {
+        let count = self.laws.len();
+        let newest_first = (0..count).map(|age| &self.laws[(self.latest + count - age) % count]);
+        let mut found = &self.laws[self.latest];
+        for law in newest_first.filter(|(from_s, _)| from_s.is_finite()) {
+            found = law;
+            // Times are sums of periods: round-off must not decide.
+            if law.0 <= time_s + 1e-9 {
+                break;
+            }
+        }
+        ((time_s - found.0).max(0.0), &found.1)
     }
 }
 
@@ -124,5 +173,35 @@ pub(crate) fn write_law(law: &Law, message_joint: &[usize], command: &mut Comman
             command.gain[joint][column] = law.gain[(i, j)];
             command.gain[joint][MAX_JOINTS + column] = law.gain[(i, n + j)];
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_law_in_force_is_the_one_that_began_last() {
+        let mut history = LawHistory::new(1, 0.015, 0.005);
+        let mut law = Law::new(1);
+        for k in 0..9 {
+            law.torque[0] = f64::from(k);
+            history.push(0.005 * f64::from(k), &law);
+        }
+        let at = |time_s: f64| history.at(time_s).1.torque[0];
+        assert_eq!([at(0.0401), at(0.04), at(0.0399), at(0.0351), at(0.0301)], [8.0, 8.0, 7.0, 7.0, 6.0]);
+        assert!((history.at(0.0375).0 - 0.0025).abs() < 1e-12);
+        // Older than all that are kept: the oldest.
+        assert_eq!(at(0.0), 4.0);
+    }
+
+    #[test]
+    fn a_history_that_is_not_full_yet_knows_its_laws() {
+        let mut history = LawHistory::new(1, 0.005, 0.005);
+        let mut law = Law::new(1);
+        law.torque[0] = 3.0;
+        history.push(1.0, &law);
+        assert_eq!(history.at(0.5).1.torque[0], 3.0);
+        assert_eq!(history.at(1.5).1.torque[0], 3.0);
     }
 }

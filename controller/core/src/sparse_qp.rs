@@ -29,14 +29,20 @@ pub fn solve_sparse(
     let mut unknowns = stages * (inputs + states);
     let start: Vec<f64> = trajectory.x(0).to_vec();
 
+    // Inputs in units that make their weight 1: the solver's tolerances are absolute.
+    let unit = |k: usize, j: usize| {
+        let weight = problem.stages[k].cost.input_weight[j];
+        if weight > 0.0 && weight.is_finite() { 1.0 / libm::sqrt(weight) } else { 1.0 }
+    };
     let mut hessian = Triplets::default();
     let mut gradient = vec![0.0; unknowns];
     for (k, stage) in problem.stages.iter().enumerate() {
         for (j, (weight, linear)) in
             stage.cost.input_weight.iter().zip(&stage.cost.input_gradient).enumerate()
         {
-            hessian.add(u_at(k) + j, u_at(k) + j, *weight);
-            gradient[u_at(k) + j] += linear;
+            let unit = unit(k, j);
+            hessian.add(u_at(k) + j, u_at(k) + j, unit * unit * weight);
+            gradient[u_at(k) + j] += unit * linear;
         }
         if k == 0 {
             continue;
@@ -62,7 +68,7 @@ pub fn solve_sparse(
         for row in 0..states {
             let mut right = -stage.defect(row);
             for j in 0..inputs {
-                matrix.add(bound.len(), u_at(k) + j, stage.b()[(row, j)]);
+                matrix.add(bound.len(), u_at(k) + j, unit(k, j) * stage.b()[(row, j)]);
             }
             for (j, x) in start.iter().enumerate() {
                 let a = stage.a()[(row, j)];
@@ -94,7 +100,7 @@ pub fn solve_sparse(
             right /= tag.scale;
             for (i, &c) in coefficients.iter().enumerate().filter(|(_, c)| **c != 0.0) {
                 if i < inputs {
-                    matrix.add(bound.len(), u_at(node) + i, c);
+                    matrix.add(bound.len(), u_at(node) + i, unit(node, i) * c);
                 } else if node == 0 {
                     right -= c * start[i - inputs];
                 } else {
@@ -129,7 +135,9 @@ pub fn solve_sparse(
     }
     for k in 0..stages {
         let x = &solver.solution.x;
-        trajectory.u_mut(k).copy_from_slice(&x[u_at(k)..u_at(k) + inputs]);
+        for (j, u) in trajectory.u_mut(k).iter_mut().enumerate() {
+            *u = unit(k, j) * x[u_at(k) + j];
+        }
         trajectory.x_mut(k + 1).copy_from_slice(&x[x_at(k + 1)..x_at(k + 1) + states]);
     }
     Ok(iterations)

@@ -28,6 +28,7 @@ pub(crate) fn check(scenario: &Scenario) -> Result<(), Violation> {
     within("plant.friction", plant.friction, 0.0, 10.0)?;
     within("plant.mass_scale", plant.mass_scale, 0.1, 10.0)?;
     within("plant.inertia_scale", plant.inertia_scale, 0.1, 10.0)?;
+    each("plant.com_shift_m", &plant.com_shift_m, 1.0)?;
     within("plant.actuator_delay_s", plant.actuator_delay_s, 0.0, 0.1)?;
     whole("duration_s", *duration_s, "plant.step_s", *duration_s / plant.step_s)?;
 

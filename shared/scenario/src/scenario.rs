@@ -68,6 +68,8 @@ pub struct PlantSettings {
     pub mass_scale: f64,
     /// The inertias about the mass centres are further multiplied by this.
     pub inertia_scale: f64,
+    /// The mass centres of the plant's links are this far from those of the model, in each link's frame, m.
+    pub com_shift_m: [f64; 3],
     /// Time from a torque asked to the torque given, s; rounded to whole steps.
     pub actuator_delay_s: f64,
     /// Whether the actuators keep to the torque limits of the URDF.
@@ -290,6 +292,7 @@ impl Default for PlantSettings {
             friction: 0.7,
             mass_scale: 1.0,
             inertia_scale: 1.0,
+            com_shift_m: [0.0; 3],
             actuator_delay_s: 0.0,
             torque_limits: true,
         }
