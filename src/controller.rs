@@ -8,9 +8,11 @@ use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::Channel;
 
 use crate::cli::PartArguments;
-use crate::part::{Supervisor, ended, leave_part, message_run_id, prepare_machine, run_id, say};
+use crate::part::{
+    Supervisor, ended, leave_part, leave_records, message_run_id, prepare_machine, run_id, say,
+};
 use crate::robot_controller::RobotController;
-use crate::run_folder::CONTROLLER_PART;
+use crate::run_folder::{CONTROLLER_PART, CYCLE_RECORDS};
 use crate::setup::Setup;
 use crate::summary::ControllerPart;
 use crate::verdict::{Ended, Failure};
@@ -41,10 +43,16 @@ pub fn controller(arguments: &PartArguments, allocations: fn() -> u64) -> Result
     if scenario.clock == Clock::Realtime {
         controller_loop = controller_loop.counting(allocations);
     }
-    let (ending, figures) = controller_loop.run(&mut controller, &mut membership).map_err(Failure::fault)?;
+    if arguments.timing {
+        controller_loop = controller_loop.recording();
+    }
+    let (ending, figures, records) =
+        controller_loop.run(&mut controller, &mut membership).map_err(Failure::fault)?;
     drop(membership);
     supervisor.stand_in(run);
-    leave_part(arguments.out.as_deref(), CONTROLLER_PART, &part(scenario, &figures))?;
+    let folder = arguments.out.as_deref();
+    leave_records(folder, CYCLE_RECORDS, &records)?;
+    leave_part(folder, CONTROLLER_PART, &part(scenario, &figures))?;
     ended(ending, "plant")
 }
 

@@ -22,6 +22,7 @@
 //! | [`mod@report`] | the run to look at: `report.html` and pictures of the key plots |
 //! | [`steering`] | what a person does to a running plant |
 //! | [`view`] | the live page: watch, pull, pause |
+//! | [`timing`] | the timing of the loop certified: figures, causes of missed deadlines, verdict |
 //! | [`status_line`] | one line about the running run |
 
 pub mod cli;
@@ -50,6 +51,7 @@ pub mod status_line;
 pub mod steering;
 pub mod summary;
 pub mod supervisor;
+pub mod timing;
 pub mod truth;
 pub mod verdict;
 pub mod view;

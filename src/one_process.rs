@@ -71,8 +71,9 @@ pub fn simulate(setup: &Setup, log: Log, stop: &StopFlag) -> Result<Simulated, F
     let plant_loop = PlantLoop::new(scenario, states, &mut answers, &blank, log);
     match plant_loop.run(&mut robot, &mut Alone(stop.clone())) {
         Err(fault) => Ok(Simulated::Fault(fault.to_string())),
-        Ok((_, mut plant, log)) => {
-            plant.log_records_dropped = log.finish()?;
+        Ok(run) => {
+            let mut plant = run.part;
+            plant.log_records_dropped = run.log.finish()?;
             let figures = answers.controller_loop.figures().clone();
             Ok(Simulated::Ended { plant: Box::new(plant), figures })
         }

@@ -15,9 +15,11 @@ use delmpc_messages::{Command, PlantState, ProcessState, status};
 use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::{LinkError, Publisher, Subscriber};
 
-use crate::clock::{Ticker, monotonic_ns};
+use crate::clock::{Tick, Ticker, monotonic_ns};
 use crate::figures::{CycleFigure, CycleFigures};
 use crate::membership::{Attendance, Order};
+use crate::records::{CycleRecord, Records};
+use crate::usage::Usage;
 
 /// What computes a command from a state.
 pub trait Controller {
@@ -55,6 +57,8 @@ pub struct ControllerLoop<'a, S, P> {
     /// Counts the heap allocations of this process so far.
     allocations: Option<fn() -> u64>,
     figures: CycleFigures,
+    /// Every cycle with its times, when somebody wants them.
+    records: Records<CycleRecord>,
 }
 
 impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S, P> {
@@ -71,7 +75,15 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
             delay_ns: (scenario.sensors.delay_s * 1e9).round() as u64,
             allocations: None,
             figures: CycleFigures::with_capacity(cycles as usize + 1000),
+            records: Records::none(),
         }
+    }
+
+    /// Keeps a record of every cycle.
+    #[must_use]
+    pub fn recording(mut self) -> Self {
+        self.records = Records::with_capacity(self.figures.capacity());
+        self
     }
 
     /// Counts the heap allocations of every cycle, by a function that counts those of the process so far.
@@ -89,13 +101,13 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
         mut self,
         controller: &mut impl Controller,
         membership: &mut impl Attendance,
-    ) -> Result<(Ending, CycleFigures), LinkError> {
+    ) -> Result<(Ending, CycleFigures, Records<CycleRecord>), LinkError> {
         let ending = match self.scenario.clock {
             Clock::Realtime => self.run_by_the_clock(controller, membership)?,
             Clock::Lockstep => self.run_state_by_state(controller, membership)?,
         };
         membership.announce(ProcessState::Finished)?;
-        Ok((ending, self.figures))
+        Ok((ending, self.figures, self.records))
     }
 
     fn run_by_the_clock(
@@ -124,7 +136,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
             if !running {
                 self.warm_up(controller);
             }
-            let sent_ns = self.cycle(controller, tick.due_ns)?;
+            let sent_ns = self.cycle(controller, tick)?;
             if running {
                 let missed = u64::from(sent_ns > tick.due_ns + period_ns);
                 self.figures.deadline_misses += missed + tick.missed;
@@ -152,7 +164,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
             if self.plant_is_done() {
                 return Ok(Ending::Finished);
             }
-            self.cycle(controller, 0)?;
+            self.cycle(controller, Tick::default())?;
             if self.state.header.sequence == 1 {
                 membership.announce(ProcessState::Ready)?;
             }
@@ -165,7 +177,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
     /// When a link breaks.
     pub fn answer(&mut self, controller: &mut impl Controller) -> Result<(), LinkError> {
         if self.receive()? && !self.plant_is_done() {
-            self.cycle(controller, 0)?;
+            self.cycle(controller, Tick::default())?;
         }
         Ok(())
     }
@@ -193,6 +205,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
     fn first_answer_given(&mut self, membership: &mut impl Attendance) -> Result<(), LinkError> {
         // What the first cycles cost is not what a cycle costs.
         self.figures = CycleFigures::with_capacity(self.figures.capacity());
+        self.records.clear();
         membership.announce(ProcessState::Ready)
     }
 
@@ -204,8 +217,9 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
     }
 
     /// One cycle; returns when its command was sent. In lockstep nothing that depends on a clock enters the command.
-    fn cycle(&mut self, controller: &mut impl Controller, due_ns: u64) -> Result<u64, LinkError> {
+    fn cycle(&mut self, controller: &mut impl Controller, tick: Tick) -> Result<u64, LinkError> {
         let realtime = self.scenario.clock == Clock::Realtime;
+        let usage = self.records.are_kept().then(Usage::now);
         let begin_ns = monotonic_ns();
         let measured_ns = self.state.header.sent_at_ns;
         // The plant's clock runs with ours; a state says what it showed when it was measured, and is sent `delay_s` later. It
@@ -227,7 +241,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
         self.commands.send(command)?;
         let sent_ns = monotonic_ns();
         let figure = CycleFigure {
-            total_ns: computed_ns - if realtime { due_ns.min(begin_ns) } else { begin_ns },
+            total_ns: computed_ns - if realtime { tick.due_ns.min(begin_ns) } else { begin_ns },
             linearize_ns: command.report.linearize_ns,
             riccati_ns: command.report.riccati_ns,
             qp_ns: command.report.qp_ns,
@@ -235,6 +249,11 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
         };
         self.figures.add(command, figure);
         command.report.publish_ns = if realtime { sent_ns - computed_ns } else { 0 };
+        if let Some(before) = usage {
+            let times = [tick.due_ns, tick.due_ns + tick.late_ns, begin_ns, computed_ns, sent_ns];
+            let used = Usage::now().since(&before);
+            self.records.keep(CycleRecord::new(times, tick.missed, &self.state, command, &used));
+        }
         Ok(sent_ns)
     }
 }

@@ -35,5 +35,6 @@ pub use document::Document;
 pub use error::{Place, ScenarioError};
 pub use scenario::{
     Clock, ConstraintSettings, ControllerKind, ControllerSettings, PlantSettings, ProcessSettings,
-    PushSettings, ReachSettings, RobotSettings, Scenario, SensorSettings, SuccessSettings, WeightSettings,
+    PushSettings, ReachSettings, RobotSettings, Scenario, SensorSettings, SuccessSettings, TimingSettings,
+    WeightSettings,
 };

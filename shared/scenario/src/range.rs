@@ -1,6 +1,6 @@
 //! The rules values must keep. Each names the key, the value, the rule and a remedy.
 
-use crate::{ControllerSettings, Scenario};
+use crate::{ControllerSettings, Scenario, TimingSettings};
 
 /// A broken rule.
 #[derive(Debug, Clone, PartialEq)]
@@ -111,7 +111,25 @@ pub(crate) fn check(scenario: &Scenario) -> Result<(), Violation> {
     ] {
         within(key, value, 0.0, f64::MAX)?;
     }
-    within("success.min_cop_margin_m", success.min_cop_margin_m, -10.0, 10.0)
+    within("success.min_cop_margin_m", success.min_cop_margin_m, -10.0, 10.0)?;
+    check_timing(&scenario.timing)
+}
+
+fn check_timing(timing: &TimingSettings) -> Result<(), Violation> {
+    within("timing.event_s", timing.event_s, 1e-6, 1.0)?;
+    within("timing.compute_budget", timing.compute_budget, 0.01, 1.0)?;
+    within("timing.compute_spread", timing.compute_spread, 1.0, 1e3)?;
+    for (key, value) in [
+        ("timing.misses_of_floor", Some(timing.misses_of_floor)),
+        ("timing.wake_up_of_floor", Some(timing.wake_up_of_floor)),
+        ("timing.round_trip_of_floor", Some(timing.round_trip_of_floor)),
+        ("timing.max_wake_up_p99_s", timing.max_wake_up_p99_s),
+        ("timing.max_cycle_p999_s", timing.max_cycle_p999_s),
+        ("timing.max_age_p99_s", timing.max_age_p99_s),
+    ] {
+        within(key, value.unwrap_or(0.0), 0.0, f64::MAX)?;
+    }
+    Ok(())
 }
 
 fn check_controller(controller: &ControllerSettings) -> Result<(), Violation> {
