@@ -55,7 +55,8 @@ Examples:
   delmpc timing                                       60 s alone and 60 s under co-load, plant on core 0, controller on core 1
   delmpc timing --duration 10 --cores 2,3
   delmpc timing --one-core --set controller.mpc_rate_hz=100
-  delmpc timing --no-rt                               without privileges, by the thresholds relative to the floor";
+  delmpc timing --no-rt                               without privileges, by the thresholds relative to the floor
+  delmpc timing --faults                              every fault of configs/scenarios/atlas_faults.toml";
 
 const COMPLETIONS_EXAMPLES: &str = "\
 Examples:

@@ -8,6 +8,7 @@ use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::Channel;
 
 use crate::cli::PartArguments;
+use crate::faults::FaultyController;
 use crate::part::{
     Supervisor, ended, leave_part, leave_records, message_run_id, prepare_machine, run_id, say,
 };
@@ -26,7 +27,7 @@ pub fn controller(arguments: &PartArguments, allocations: fn() -> u64) -> Result
     let setup = Setup::read(&arguments.scenario, &arguments.set)?;
     let scenario = &setup.scenario;
     let run = run_id(arguments, &setup)?;
-    let mut controller = RobotController::new(&setup)?;
+    let mut controller = FaultyController::new(RobotController::new(&setup)?, scenario);
     prepare_machine(Role::Controller, scenario);
 
     let hash = setup.joint_set_hash();

@@ -9,6 +9,7 @@
 //! | [`verdict`] | how a command ends: exit status and message |
 //! | [`setup`] | scenario and robot from their files, checked against each other |
 //! | [`simulated_robot`], [`robot_controller`] | plant and controller made from a setup |
+//! | [`faults`] | faults of messages on purpose |
 //! | [`run_folder`] | the folder a run leaves behind |
 //! | [`supervisor`] | starts, watches and ends the two processes |
 //! | [`part`] | what the two processes have in common |
@@ -29,6 +30,7 @@ pub mod cli;
 pub mod completions;
 pub mod controller;
 pub mod drawing;
+pub mod faults;
 pub mod log;
 pub mod log_viewer;
 pub mod metrics;

@@ -9,6 +9,7 @@ use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::{Channel, RunId};
 
 use crate::cli::PartArguments;
+use crate::faults::FaultyPlant;
 use crate::log::{Log, LogHead};
 use crate::log_viewer::LogViewer;
 use crate::part::{
@@ -30,7 +31,7 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
     let setup = Setup::read(&arguments.scenario, &arguments.set)?;
     let scenario = &setup.scenario;
     let run = run_id(arguments, &setup)?;
-    let mut robot = SimulatedRobot::new(&setup)?;
+    let mut robot = FaultyPlant::new(SimulatedRobot::new(&setup)?, scenario);
     let log = match &arguments.out {
         Some(folder) if !arguments.timing => {
             Log::create(&folder.join("log.mcap"), log_head(&setup, run), scenario.clock == Clock::Lockstep)?

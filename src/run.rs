@@ -119,6 +119,8 @@ fn run_in_two_processes(
         steering: view.as_ref().map(View::pipe),
         show_messages: talkative,
         hang_s: setup.scenario.process.hang_s,
+        restarts: 0,
+        late: None,
     };
     let show = talkative && std::io::stderr().is_terminal();
     let mut line = show.then(|| StatusLine::new(setup, run));

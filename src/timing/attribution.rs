@@ -9,12 +9,14 @@
 //!     late           |   own time + time taken      |
 //! ```
 //!
-//! A fourth sign is the *slowness* of the core meanwhile: the time of the witness's fixed work, relative to its median over the run.
+//! A core can also be slow without being taken away, when strangers use the caches and the memory it shares. Two signs, which must agree: the
+//! *slowness*, the longest the witness's fixed work took during the cycle, and the *pace*, the time of those stages of the cycle whose work is
+//! the same every time (linearise, Riccati), both relative to their medians over the run.
 //!
 //! | cause | when |
 //! |---|---|
 //! | the machine, by taking the core | the own time is within the budget, and at least `event_s` was taken |
-//! | the machine, by being slow | the own time over the slowness is within the budget, and the slowness at least [`SLOW`] |
+//! | the machine, by being slow | the slowness is at least [`SLOW`], and the own time over the pace is within the budget |
 //! | as the cycle before | that one missed its deadline and was still under way |
 //! | the plant, on a shared core | the own time is within the budget, and the plant had the core for longer than the machine took it |
 //! | the software | everything else, also where nothing explains it |
@@ -147,12 +149,16 @@ pub struct Account {
     pub taken_ns: u64,
     /// Of that: the plant had the core.
     pub plant_ns: u64,
-    /// Time of the witness's fixed work meanwhile over its median; 1 where the witness did not look.
+    /// Longest time of the witness's fixed work meanwhile over its median; 1 where the witness did not look.
     pub slowness: f64,
+    /// Time of the stages that do the same work every time over its median.
+    pub pace: f64,
 }
 
 /// Slowness from which on a core is said to be slow. Between calm cores the fixed work varies by less.
 pub const SLOW: f64 = 1.5;
+/// The same while a cycle is still behind because of a slow core.
+const STILL_SLOW: f64 = 1.2;
 
 impl Account {
     /// Time the cycle itself computed.
@@ -239,6 +245,8 @@ pub fn accounts(cycles: &[CycleRecord], evidence: &Evidence<'_>) -> Vec<Account>
     };
     let work_ns = evidence.witness.ticks.iter().map(|tick| tick.done_ns - tick.woke_ns);
     let usual_ns = Times::of(work_ns).at_ns(0.5).unwrap_or(0).max(1) as f64;
+    let fixed_ns = |cycle: &CycleRecord| cycle.linearize_ns + cycle.riccati_ns;
+    let usual_fixed_ns = Times::of(cycles.iter().map(fixed_ns)).at_ns(0.5).unwrap_or(0).max(1) as f64;
     let mut last_sent_ns = 0;
     let account = |cycle: &CycleRecord| {
         let in_cycle = [cycle.begin_ns, cycle.sent_ns];
@@ -246,7 +254,7 @@ pub fn accounts(cycles: &[CycleRecord], evidence: &Evidence<'_>) -> Vec<Account>
         let witness = &evidence.witness;
         let looks = ticks_in(witness.ticks, in_cycle);
         let ours_ns = plant_ns + witness.cost_ns * looks.len() as u64;
-        let slow_ns = looks.iter().map(|tick| tick.done_ns - tick.woke_ns).sum::<u64>() as f64;
+        let slowest_ns = looks.iter().map(|tick| tick.done_ns - tick.woke_ns).max();
         let off_core_ns = (cycle.sent_ns - cycle.begin_ns).saturating_sub(cycle.cpu_ns + ours_ns);
         let stalled_ns = overlap(witness.stalls, [cycle.woke_ns, cycle.sent_ns]);
         let (late_ns, backlog_ns) = match last_sent_ns > cycle.due_ns {
@@ -260,7 +268,8 @@ pub fn accounts(cycles: &[CycleRecord], evidence: &Evidence<'_>) -> Vec<Account>
             wall_ns: cycle.sent_ns - cycle.woke_ns,
             taken_ns: off_core_ns.max(stalled_ns),
             plant_ns,
-            slowness: if looks.is_empty() { 1.0 } else { slow_ns / (looks.len() as f64 * usual_ns) },
+            slowness: slowest_ns.map_or(1.0, |slowest_ns| slowest_ns as f64 / usual_ns),
+            pace: fixed_ns(cycle) as f64 / usual_fixed_ns,
         }
     };
     cycles.iter().map(account).collect()
@@ -306,9 +315,11 @@ pub fn misses(cycles: &[CycleRecord], accounts: &[Account], evidence: &Evidence<
 
 fn cause_of(account: &Account, inherited: Option<Cause>, evidence: &Evidence<'_>) -> Cause {
     let taken_ns = account.taken_ns + account.late_ns;
+    // A slow stretch ends gradually.
+    let slow = if inherited == Some(Cause::SlowMachine) { STILL_SLOW } else { SLOW };
     if account.own_ns() > evidence.budget_ns {
-        let at_usual_speed_ns = account.own_ns() as f64 / account.slowness.max(1.0);
-        let slow = account.slowness >= SLOW && at_usual_speed_ns <= evidence.budget_ns as f64;
+        let at_usual_speed_ns = account.own_ns() as f64 / account.pace.max(1.0);
+        let slow = account.slowness >= slow && at_usual_speed_ns <= evidence.budget_ns as f64;
         if slow { Cause::SlowMachine } else { Cause::Software }
     } else if let Some(cause) = inherited {
         cause
@@ -380,17 +391,13 @@ mod tests {
     }
 
     #[test]
-    fn a_slow_core_is_told_from_slow_software_by_the_work_of_the_witness() {
-        let looks = |third_takes: u64| {
-            [0, 100, 200, 3, 300].map(|ms| FloorTick {
-                woke_ns: ms * MS,
-                done_ns: ms * MS + if ms == 3 { third_takes } else { 10 },
-                ..FloorTick::default()
-            })
-        };
-        let cause = |takes: u64| {
-            let mut ticks = looks(takes);
-            ticks.sort_by_key(|tick| tick.woke_ns);
+    fn a_slow_core_is_told_from_slow_software_by_the_work_of_the_witness_and_its_own() {
+        let usual = || (0..9).map(|k| CycleRecord { riccati_ns: 2 * MS, ..cycle(k, 0, 3, 3) });
+        // The tenth cycle computes for 8 ms; the witness's work takes `work` then, and 10 otherwise.
+        let cause = |work: u64, riccati_ns: u64| {
+            let tick = |k: u64| FloorTick { woke_ns: k * MS, done_ns: k * MS + 10, ..FloorTick::default() };
+            let mut ticks: Vec<FloorTick> = (0..60).map(tick).collect();
+            ticks[48].done_ns = 48 * MS + work;
             let evidence = Evidence {
                 steps: &[],
                 witness: Witness { ticks: &ticks, ..Witness::default() },
@@ -399,13 +406,13 @@ mod tests {
                 budget_ns: 4 * MS,
                 event_ns: MS / 10,
             };
-            let cycles = [cycle(0, 0, 8, 8)];
+            let cycles: Vec<_> = usual().chain([CycleRecord { riccati_ns, ..cycle(9, 0, 8, 8) }]).collect();
             misses(&cycles, &accounts(&cycles, &evidence), &evidence)[0].cause
         };
-        assert_eq!(cause(10), Cause::Software);
-        assert_eq!(cause(14), Cause::Software, "below the threshold");
-        assert_eq!(cause(18), Cause::Software, "too little to explain it");
-        assert_eq!(cause(21), Cause::SlowMachine);
+        assert_eq!(cause(20, 5 * MS), Cause::SlowMachine);
+        assert_eq!(cause(10, 5 * MS), Cause::Software, "the witness was not slow");
+        assert_eq!(cause(20, 2 * MS), Cause::Software, "the same work was not slow");
+        assert_eq!(cause(20, 3 * MS), Cause::Software, "too little to explain it");
     }
 
     #[test]

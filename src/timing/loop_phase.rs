@@ -56,6 +56,8 @@ pub fn run_loop(setup: &Setup, folder: &Path, stop: &StopFlag) -> Result<LoopRun
         steering: None,
         show_messages: false,
         hang_s: scenario.process.hang_s,
+        restarts: 0,
+        late: None,
     };
     let course = supervision.supervise(stop, |_| {});
     let witnesses: Vec<_> = witnesses
@@ -71,8 +73,7 @@ pub fn run_loop(setup: &Setup, folder: &Path, stop: &StopFlag) -> Result<LoopRun
         Course::Interrupted => Some("interrupted".to_owned()),
         Course::Fault(why) => Some(why.clone()),
     };
-    let plant: Option<PlantPart> = take_json(&folder.file(PLANT_PART));
-    let controller: Option<ControllerPart> = take_json(&folder.file(CONTROLLER_PART));
+    let (plant, controller) = take_parts(&folder);
     let cycles = take_records(&folder.file(CYCLE_RECORDS));
     let steps = take_records(&folder.file(STEP_RECORDS));
     let summary = Summary::new(scenario, plant, controller, fault);
@@ -122,6 +123,11 @@ pub fn fresh_run() -> RunId {
 pub fn path_text(path: &Path) -> Result<String, Failure> {
     let text = path.to_str().map(str::to_owned);
     text.ok_or_else(|| Failure::Input(format!("{}: the path is not UTF-8", path.display())))
+}
+
+/// What the processes found out, removed from the folder; `None` for one that left nothing.
+pub fn take_parts(folder: &RunFolder) -> (Option<PlantPart>, Option<ControllerPart>) {
+    (take_json(&folder.file(PLANT_PART)), take_json(&folder.file(CONTROLLER_PART)))
 }
 
 /// What a process left, removed from the folder; `None` when it left nothing that can be read.

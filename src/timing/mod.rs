@@ -8,11 +8,14 @@
 //! | occupied floor | a thread whose fixed work takes as long as a cycle | the share of deadlines this machine makes anybody miss |
 //! | transport | two processes that poll, beside a bare flag | what the link costs |
 //!
+//! With `--faults` it runs every fault of a scenario instead ([`campaign`]).
+//!
 //! Files: [`floor`], [`co_load`], [`transport`] measure; [`loop_phase`] runs the processes; [`attribution`] finds who missed a deadline;
 //! [`phases`] makes figures, [`criteria`] judges, [`mod@table`] shows. What the operating system refuses is a warning, and the
 //! thresholds relative to the floor still hold.
 
 pub mod attribution;
+pub mod campaign;
 pub mod co_load;
 pub mod criteria;
 pub mod figures;
@@ -28,11 +31,11 @@ pub mod transport;
 use std::path::{Path, PathBuf};
 
 use delmpc_controller_process::stop::StopFlag;
-use delmpc_scenario::Clock;
+use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::remove_dead_runs;
 use serde::Serialize;
 
-use crate::setup::{Setup, scenario_file};
+use crate::setup::{FAULT_SCENARIO, Setup, scenario_file, scenario_file_or};
 use crate::timing::criteria::{Criterion, Measured, criteria};
 use crate::timing::machine_facts::MachineFacts;
 use crate::timing::phases::{FloorFigures, LoopFigures, Phases, without_privileges};
@@ -45,7 +48,8 @@ const MESSAGES: u64 = 50_000;
 /// Arguments of `delmpc timing`.
 #[derive(Debug, Clone, clap::Args)]
 pub struct TimingArguments {
-    /// Scenario file [default: configs/scenarios/atlas_one_foot.toml]; its [timing] has the thresholds
+    /// Scenario file [default: configs/scenarios/atlas_one_foot.toml; with --faults configs/scenarios/atlas_faults.toml]; its [timing] has
+    /// the thresholds
     pub scenario: Option<PathBuf>,
     /// Override a key of the scenario, for example --set timing.compute_spread=2
     #[arg(long, value_name = "KEY=VALUE")]
@@ -65,6 +69,12 @@ pub struct TimingArguments {
     /// Leave out the phases with co-load
     #[arg(long)]
     pub no_load: bool,
+    /// Run every [[fault]] of the scenario instead, each in a run of its own: ladder levels and the robot's fate
+    #[arg(long, conflicts_with_all = ["duration", "one_core", "no_load"])]
+    pub faults: bool,
+    /// With --faults: the fault that moves the machine's wall clock for a moment may do so
+    #[arg(long, requires = "faults")]
+    pub clock_jump: bool,
     /// Folder for timing.json, the plots and the results of the runs [default: runs/timing]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
@@ -111,6 +121,9 @@ pub struct TimingReport {
 /// # Errors
 /// [`Failure::Input`] before anything runs; [`Failure::Fault`] when a threshold is broken or a phase broke off.
 pub fn timing(arguments: &TimingArguments) -> Result<Ended, Failure> {
+    if arguments.faults {
+        return faults(arguments);
+    }
     let setup = timing_setup(arguments)?;
     let folder = arguments.out.clone().unwrap_or_else(|| PathBuf::from("runs/timing"));
     std::fs::create_dir_all(&folder)
@@ -132,6 +145,44 @@ pub fn timing(arguments: &TimingArguments) -> Result<Ended, Failure> {
     verdict(&report)
 }
 
+/// Runs every fault of the scenario.
+fn faults(arguments: &TimingArguments) -> Result<Ended, Failure> {
+    let file = scenario_file_or(arguments.scenario.as_deref(), FAULT_SCENARIO)?;
+    let mut setup = Setup::read(&file, &arguments.set)?;
+    if setup.scenario.fault.is_empty() {
+        return Err(Failure::Input(format!("{}: it has no [[fault]]", file.display())));
+    }
+    set_cores(arguments, &mut setup.scenario);
+    let folder = arguments.out.clone().unwrap_or_else(|| PathBuf::from("runs/faults"));
+    std::fs::create_dir_all(&folder)
+        .map_err(|error| Failure::Input(format!("--out {}: {error}", folder.display())))?;
+    let stop = StopFlag::on_signals().map_err(Failure::fault)?;
+    remove_dead_runs();
+    if !arguments.json {
+        println!("{}", campaign::head());
+    }
+    let tell = |trial: &campaign::Trial| {
+        if !arguments.json {
+            println!("{}", campaign::line(trial));
+        }
+    };
+    let trials = campaign::campaign(&setup, &folder, &stop, arguments.clock_jump, tell)?;
+    let Some(trials) = trials else { return Ok(Ended::Interrupted) };
+    let json = serde_json::to_string_pretty(&trials).map_err(Failure::fault)?;
+    let file = folder.join("faults.json");
+    std::fs::write(&file, &json).map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))?;
+    if arguments.json {
+        println!("{json}");
+    } else {
+        println!("{}", file.display());
+    }
+    let wrong: Vec<&str> = trials.iter().filter(|t| t.wrong.is_some()).map(|t| t.fault.as_str()).collect();
+    if wrong.is_empty() {
+        return Ok(Ended::Well);
+    }
+    Err(Failure::Fault(format!("faults with consequences they must not have: {}", wrong.join("; "))))
+}
+
 /// The scenario with its processes on their cores.
 fn timing_setup(arguments: &TimingArguments) -> Result<Setup, Failure> {
     let file = scenario_file(arguments.scenario.as_deref())?;
@@ -143,6 +194,11 @@ fn timing_setup(arguments: &TimingArguments) -> Result<Setup, Failure> {
     }
     scenario.clock = Clock::Realtime;
     scenario.duration_s = steps * scenario.plant.step_s;
+    set_cores(arguments, scenario);
+    Ok(setup)
+}
+
+fn set_cores(arguments: &TimingArguments, scenario: &mut Scenario) {
     let plant = arguments.cores.first().copied().unwrap_or(0);
     let controller = arguments.cores.get(1).copied().unwrap_or(plant);
     scenario.process.plant_core = Some(plant);
@@ -150,7 +206,6 @@ fn timing_setup(arguments: &TimingArguments) -> Result<Setup, Failure> {
     if arguments.no_rt {
         without_privileges(&mut scenario.process);
     }
-    Ok(setup)
 }
 
 /// One phase after the other; `None`: interrupted.

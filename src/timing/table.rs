@@ -126,7 +126,7 @@ fn one_loop(text: &mut String, figures: &LoopFigures) {
         let ms = |ns: u64| ns as f64 * 1e-6;
         let _ = write!(
             text,
-            "  missed at {:8.3} s by {:6.3} ms ({} in a row): {}; woken late {:.3}, behind {:.3}, taken {:.3}, own {:.3} ms, slowness {:.2}; \
+            "  missed at {:8.3} s by {:6.3} ms ({} in a row): {}; woken late {:.3}, behind {:.3}, taken {:.3}, own {:.3} ms, slowness {:.1}, pace {:.1}; \
              most in {}",
             miss.time_s,
             1e3 * miss.overrun_s,
@@ -137,6 +137,7 @@ fn one_loop(text: &mut String, figures: &LoopFigures) {
             ms(miss.account.taken_ns),
             ms(miss.account.own_ns()),
             miss.account.slowness,
+            miss.account.pace,
             miss.stage.name()
         );
         let _ = match miss.robot {

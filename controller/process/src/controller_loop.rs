@@ -41,7 +41,7 @@ pub enum Ending {
 const PAUSE: Duration = Duration::from_micros(50);
 
 /// Cycles before the first answer in real time.
-const WARM_UP_CYCLES: u32 = 10;
+pub const WARM_UP_CYCLES: u32 = 10;
 
 /// The loop and its ends of the links.
 #[derive(Debug)]
@@ -128,7 +128,11 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
             if self.plant_is_done() {
                 return Ok(Ending::Finished);
             }
-            running |= self.state.header.sequence > 1;
+            if !running && self.state.header.sequence > 1 {
+                running = true;
+                // Without a first answer of ours: the run is under way, and we take over from one that is gone.
+                membership.announce(ProcessState::Ready)?;
+            }
             if !news && !running {
                 self.commands.serve_newcomers()?;
                 continue;
@@ -258,9 +262,9 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
     }
 }
 
-/// Says which state a command answers, and numbers it.
+/// Says which state a command answers, and numbers it: higher than all before, those of a controller that is gone included.
 pub fn address(command: &mut Command, state: &PlantState) {
-    command.header.sequence += 1;
+    command.header.sequence = command.header.sequence.max(state.applied_command_sequence) + 1;
     command.state_sequence = state.header.sequence;
     if state.header.sequence <= 1 {
         // The plant that waits for its first answer has had commands before, as far as the robot is concerned.

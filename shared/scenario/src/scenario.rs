@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::FaultSettings;
+
 /// Everything that decides a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -30,6 +32,9 @@ pub struct Scenario {
     /// Pushes: one table `[push]` or a list `[[push]]`.
     #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
     pub push: Vec<PushSettings>,
+    /// Faults on purpose: one table `[fault]` or a list `[[fault]]`.
+    #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
+    pub fault: Vec<FaultSettings>,
     /// What counts as success.
     pub success: SuccessSettings,
     /// What counts as timing kept: `delmpc timing`.
@@ -329,6 +334,7 @@ impl Default for Scenario {
             process: ProcessSettings::default(),
             reach: None,
             push: Vec::new(),
+            fault: Vec::new(),
             success: SuccessSettings::default(),
             timing: TimingSettings::default(),
         }
@@ -470,6 +476,7 @@ impl Scenario {
             },
             reach: Some(ReachSettings::default()),
             push: vec![PushSettings::default()],
+            fault: vec![FaultSettings::default()],
             timing: TimingSettings {
                 max_misses: Some(0),
                 max_wake_up_p99_s: Some(0.0),
