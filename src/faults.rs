@@ -7,7 +7,8 @@ use delmpc_controller_process::controller_loop::Controller;
 use delmpc_messages::{Command, PlantState};
 use delmpc_scenario::{Clock, FaultKind, FaultSettings, FaultTarget, Scenario};
 use delmpc_transport::{
-    Corrupt, Fault, FaultInjector, InProcessPublisher, Lossy, Publisher, Schedule, Subscriber, in_process_link,
+    Corrupt, Fault, FaultInjector, InProcessPublisher, Lossy, Publisher, Schedule, Subscriber,
+    in_process_link,
 };
 
 use crate::plant_process::Plant;

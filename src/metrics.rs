@@ -271,7 +271,9 @@ mod tests {
     #[test]
     fn a_torque_that_is_no_number_is_counted_and_what_lies_beyond_the_joints_is_not() {
         let mut metrics = Metrics::new(&scenario());
-        for (k, (joint, torque)) in [(0, 1.0), (0, f64::NAN), (0, f64::INFINITY), (1, f64::NAN)].into_iter().enumerate() {
+        for (k, (joint, torque)) in
+            [(0, 1.0), (0, f64::NAN), (0, f64::INFINITY), (1, f64::NAN)].into_iter().enumerate()
+        {
             let mut truth = truth(k as u64);
             truth.torque[joint] = torque;
             metrics.observe(&truth);

@@ -108,11 +108,7 @@ pub fn leave_part(folder: Option<&Path>, name: &str, part: &impl Serialize) -> R
 ///
 /// # Errors
 /// When the file cannot be written.
-pub fn leave_records<R: Pod>(
-    folder: Option<&Path>,
-    name: &str,
-    records: &Records<R>,
-) -> Result<(), Failure> {
+pub fn leave_records<R: Pod>(folder: Option<&Path>, name: &str, records: &Records<R>) -> Result<(), Failure> {
     let Some(folder) = folder.filter(|_| records.are_kept()) else { return Ok(()) };
     if records.lost() > 0 {
         say(&format!("warning: no room for {} of the records in {name}", records.lost()));

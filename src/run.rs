@@ -2,11 +2,10 @@
 
 use std::io::{IsTerminal, Write};
 use std::path::Path;
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use delmpc_controller_process::stop::StopFlag;
 use delmpc_scenario::Clock;
-use delmpc_transport::{RunId, remove_dead_runs};
+use delmpc_transport::remove_dead_runs;
 use serde::de::DeserializeOwned;
 
 use crate::cli::{RunArguments, RunOptions};
@@ -15,7 +14,7 @@ use crate::run_folder::{CONTROLLER_PART, PLANT_PART, RunFolder};
 use crate::setup::{Setup, scenario_file};
 use crate::status_line::StatusLine;
 use crate::summary::{Summary, table};
-use crate::supervisor::{Course, Supervision};
+use crate::supervisor::{Course, Supervision, fresh_run};
 use crate::verdict::{Ended, Failure};
 use crate::view::View;
 
@@ -104,8 +103,7 @@ fn run_in_two_processes(
 ) -> Result<Course, Failure> {
     let talkative = !options.quiet && !options.json;
     remove_dead_runs();
-    let time_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as u64);
-    let run = RunId::from_seeds(time_ns, std::process::id());
+    let run = fresh_run();
     if options.view {
         let opened = view.insert(View::new(setup, options.port)?);
         let _ = writeln!(std::io::stderr(), "open {} to begin", opened.address());

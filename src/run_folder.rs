@@ -49,6 +49,7 @@ impl RunFolder {
     ///
     /// # Errors
     /// [`Failure::Input`] when it cannot be made.
+    #[allow(clippy::disallowed_methods, reason = "a name for people, by their clock")]
     pub fn create(named: Option<&Path>, scenario: &str) -> Result<Self, Failure> {
         match named {
             Some(path) => {

@@ -18,7 +18,7 @@ use std::path::PathBuf;
 use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{JoinHandle, sleep};
-use std::time::Duration;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use delmpc_controller_process::clock::monotonic_ns;
 use delmpc_controller_process::presence::{Peer, Presence};
@@ -71,6 +71,13 @@ pub enum Course {
     Interrupted,
     /// A process failed: why.
     Fault(String),
+}
+
+/// A run nobody else has.
+#[allow(clippy::disallowed_methods, reason = "two runs differ even if the clock jumps: by their supervisors")]
+pub fn fresh_run() -> RunId {
+    let time_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as u64);
+    RunId::from_seeds(time_ns, std::process::id())
 }
 
 /// The numbers by which the operating system knows the processes, and how far they are.

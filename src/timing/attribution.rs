@@ -86,11 +86,8 @@ impl Stage {
             Self::Riccati => cycle.riccati_ns,
             Self::Qp => cycle.qp_ns,
             Self::Rest => {
-                let stages = cycle.state_in_ns
-                    + cycle.shift_ns
-                    + cycle.linearize_ns
-                    + cycle.riccati_ns
-                    + cycle.qp_ns;
+                let stages =
+                    cycle.state_in_ns + cycle.shift_ns + cycle.linearize_ns + cycle.riccati_ns + cycle.qp_ns;
                 (cycle.computed_ns.saturating_sub(cycle.begin_ns)).saturating_sub(stages)
             }
             Self::Publish => cycle.sent_ns.saturating_sub(cycle.computed_ns),
@@ -380,7 +377,11 @@ mod tests {
         assert_eq!(judge(&[cycle(0, 0, 3, 3)], &[], &[]), []);
         assert_eq!(judge(&[cycle(0, 0, 6, 3)], &[], &[]), [(Cause::Machine, 1)], "off the core");
         let stall = [[MS, 4 * MS]];
-        assert_eq!(judge(&[cycle(0, 0, 6, 6)], &stall, &[]), [(Cause::Machine, 1)], "the witness stalled too");
+        assert_eq!(
+            judge(&[cycle(0, 0, 6, 6)], &stall, &[]),
+            [(Cause::Machine, 1)],
+            "the witness stalled too"
+        );
         assert_eq!(judge(&[cycle(0, 4, 7, 3)], &[], &[]), [(Cause::Machine, 1)], "woken up late");
     }
 
@@ -430,7 +431,7 @@ mod tests {
         };
         let found = misses(&cycles, &accounts(&cycles, &evidence), &evidence);
         assert_eq!((found.len(), found[0].stage, found[0].cause), (1, Stage::Qp, Cause::Software));
-        assert_eq!((found[0].time_s, found[0].overrun_s), (0.045, 0.001));
+        assert!((found[0].time_s - 0.045).abs() < 1e-12 && (found[0].overrun_s - 0.001).abs() < 1e-12);
     }
 
     #[test]
@@ -464,7 +465,10 @@ mod tests {
         };
         let steps = [step(1, 0.04, 0), step(20, 0.03, 1), step(50, 0.01, 0), step(200, 0.0, 5)];
         let robot = robot_then(&steps, 10 * MS).unwrap();
-        assert_eq!((robot.watchdog_level, robot.cop_margin_before_m, robot.cop_margin_least_m), (1, 0.04, 0.01));
+        assert_eq!(
+            (robot.watchdog_level, robot.cop_margin_before_m, robot.cop_margin_least_m),
+            (1, 0.04, 0.01)
+        );
         assert_eq!(robot_then(&steps, 300 * MS), None);
     }
 }

@@ -26,8 +26,8 @@ use crate::one_process::{Simulated, simulate};
 use crate::run_folder::RunFolder;
 use crate::setup::Setup;
 use crate::summary::{PlantPart, Summary};
-use crate::supervisor::{Course, ProcessIds, Supervision};
-use crate::timing::loop_phase::{fresh_run, path_text, take_parts};
+use crate::supervisor::{Course, ProcessIds, Supervision, fresh_run};
+use crate::timing::loop_phase::{path_text, take_parts};
 use crate::verdict::Failure;
 
 /// How long the wall clock stays wrong.
@@ -376,7 +376,11 @@ fn in_words(fault: &FaultSettings) -> String {
         let _ = write!(text, ", {} times", fault.count);
     }
     match fault.kind {
-        FaultKind::Stale | FaultKind::Future | FaultKind::LateStart | FaultKind::ClockJump | FaultKind::Stop => {
+        FaultKind::Stale
+        | FaultKind::Future
+        | FaultKind::LateStart
+        | FaultKind::ClockJump
+        | FaultKind::Stop => {
             let _ = write!(text, ", {} ms", (1e3 * fault.size_s).round());
         }
         _ => {}

@@ -65,7 +65,9 @@ fn loop_criteria(
     let [taken, slow, shared_core, software, unexplained] = figures.missed_by;
     let machine = taken + slow;
     list.push(Criterion {
-        note: format!("{software} over budget, {shared_core} by the plant on the same core, {unexplained} unexplained"),
+        note: format!(
+            "{software} over budget, {shared_core} by the plant on the same core, {unexplained} unexplained"
+        ),
         ..at_most(
             "timing.compute_budget",
             format!("{here}: deadlines missed by the software"),
@@ -81,7 +83,8 @@ fn loop_criteria(
             settings.compute_spread,
         ));
     }
-    let same = |floor: &&FloorFigures| floor.loaded == figures.loaded && floor.core == measured.controller_core;
+    let same =
+        |floor: &&FloorFigures| floor.loaded == figures.loaded && floor.core == measured.controller_core;
     if let Some(floor) = measured.occupied.iter().find(same) {
         let share = machine as f64 / figures.cycles.max(1) as f64;
         let of_floor = if machine == 0 { 0.0 } else { share / floor.missed_share() };
@@ -119,7 +122,12 @@ fn loop_criteria(
         });
     }
     let absolute = [
-        ("timing.max_misses", "deadlines missed", settings.max_misses.map(f64::from), Some(figures.missed as f64)),
+        (
+            "timing.max_misses",
+            "deadlines missed",
+            settings.max_misses.map(f64::from),
+            Some(figures.missed as f64),
+        ),
         ("timing.max_wake_up_p99_s", "wake-up latency, 99 %, s", settings.max_wake_up_p99_s, wake_up),
         (
             "timing.max_cycle_p999_s",

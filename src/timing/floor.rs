@@ -200,8 +200,7 @@ mod tests {
     use super::*;
 
     fn settings(work: Work) -> FloorSettings {
-        let process =
-            ProcessSettings { priority: 0, lock_memory: false, ..ProcessSettings::default() };
+        let process = ProcessSettings { priority: 0, lock_memory: false, ..ProcessSettings::default() };
         FloorSettings { core: None, process, period_ns: 1_000_000, work, duration_ns: 30_000_000 }
     }
 
@@ -218,7 +217,10 @@ mod tests {
 
     #[test]
     fn a_thread_that_is_told_to_ends_early() {
-        let thread = FloorThread::start(FloorSettings { duration_ns: u64::MAX / 1_000_000, ..settings(Work::Nothing) });
+        let thread = FloorThread::start(FloorSettings {
+            duration_ns: u64::MAX / 1_000_000,
+            ..settings(Work::Nothing)
+        });
         thread.unwrap().finish().unwrap();
     }
 
@@ -228,9 +230,14 @@ mod tests {
         let ticks = [tick(100, 101), tick(200, 260), tick(300, 309), tick(400, 440)];
         let stalls = stalls(&ticks, 10);
         assert_eq!(stalls, [[200, 260], [400, 440]]);
-        for (interval, shared) in
-            [([0, 200], 0), ([0, 210], 10), ([220, 420], 60), ([250, 255], 5), ([440, 900], 0), ([0, 900], 100)]
-        {
+        for (interval, shared) in [
+            ([0, 200], 0),
+            ([0, 210], 10),
+            ([220, 420], 60),
+            ([250, 255], 5),
+            ([440, 900], 0),
+            ([0, 900], 100),
+        ] {
             assert_eq!(overlap(&stalls, interval), shared, "{interval:?}");
         }
     }

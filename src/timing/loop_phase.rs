@@ -2,18 +2,16 @@
 
 use std::fs;
 use std::path::Path;
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use bytemuck::Pod;
 use delmpc_controller_process::records::{CycleRecord, StepRecord, read_records};
 use delmpc_controller_process::stop::StopFlag;
 use delmpc_scenario::Scenario;
-use delmpc_transport::RunId;
 
 use crate::run_folder::{CONTROLLER_PART, CYCLE_RECORDS, PLANT_PART, RunFolder, STEP_RECORDS};
 use crate::setup::Setup;
 use crate::summary::{ControllerPart, PlantPart, Summary};
-use crate::supervisor::{Course, Supervision};
+use crate::supervisor::{Course, Supervision, fresh_run};
 use crate::timing::floor::{FloorRun, FloorSettings, FloorThread, WITNESS_NS, Work};
 use crate::verdict::Failure;
 
@@ -108,12 +106,6 @@ fn start_witnesses(scenario: &Scenario) -> Result<Vec<(usize, FloorThread)>, Fai
         Ok((core, FloorThread::start(settings)?))
     };
     cores.into_iter().map(witness).collect()
-}
-
-/// A run nobody else has.
-pub fn fresh_run() -> RunId {
-    let time_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as u64);
-    RunId::from_seeds(time_ns, std::process::id())
 }
 
 /// A path as an argument.

@@ -84,7 +84,8 @@ mod tests {
             realtime_budget_us: Some(950_000),
             ..MachineFacts::default()
         };
-        let expected = "P, 2 cores, virtual machine (no steal time seen), real-time threads have at most 95 % of a core";
+        let expected =
+            "P, 2 cores, virtual machine (no steal time seen), real-time threads have at most 95 % of a core";
         assert_eq!(facts.line(), expected);
         assert!(MachineFacts::read().cores > 0);
     }

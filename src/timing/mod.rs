@@ -11,7 +11,7 @@
 //! With `--faults` it runs every fault of a scenario instead ([`campaign`]).
 //!
 //! Files: [`floor`], [`co_load`], [`transport`] measure; [`loop_phase`] runs the processes; [`attribution`] finds who missed a deadline;
-//! [`phases`] makes figures, [`criteria`] judges, [`mod@table`] shows. What the operating system refuses is a warning, and the
+//! [`phases`] makes figures, [`criteria`] judges, [`mod@table`] and [`pictures`] show. What the operating system refuses is a warning, and the
 //! thresholds relative to the floor still hold.
 
 pub mod attribution;
@@ -23,6 +23,7 @@ pub mod floor;
 pub mod loop_phase;
 pub mod machine_facts;
 pub mod phases;
+pub mod pictures;
 pub mod probe;
 pub mod raw_flag;
 pub mod table;
@@ -75,7 +76,7 @@ pub struct TimingArguments {
     /// With --faults: the fault that moves the machine's wall clock for a moment may do so
     #[arg(long, requires = "faults")]
     pub clock_jump: bool,
-    /// Folder for timing.json, the plots and the results of the runs [default: runs/timing]
+    /// Folder for timing.json, the histograms (PNG, SVG) and the results of the runs [default: runs/timing, with --faults runs/faults]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Print the report as JSON and nothing else
@@ -136,6 +137,7 @@ pub fn timing(arguments: &TimingArguments) -> Result<Ended, Failure> {
     let json = serde_json::to_string_pretty(&report).map_err(Failure::fault)?;
     let file = folder.join("timing.json");
     std::fs::write(&file, &json).map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))?;
+    pictures::write(&report, &folder)?;
     if arguments.json {
         println!("{json}");
     } else {

@@ -32,7 +32,11 @@ pub struct Quantity {
 
 impl Quantity {
     fn new(key: &str, name: &str, times_ns: impl IntoIterator<Item = u64>) -> Self {
-        let times = Times::of(times_ns);
+        Self::of(key, name, &Times::of(times_ns))
+    }
+
+    /// Of times.
+    pub fn of(key: &str, name: &str, times: &Times) -> Self {
         Self { key: key.to_owned(), name: name.to_owned(), figures: times.figures(), bars: times.bars() }
     }
 }
@@ -310,8 +314,16 @@ fn loop_figures(scenario: &Scenario, run: &LoopRun, load: Option<LoadDone>) -> L
                 let late = witness.ticks.iter().map(|tick| tick.late_ns());
                 let work = witness.ticks.iter().map(|tick| tick.done_ns - tick.woke_ns);
                 [
-                    Quantity::new(&format!("witness_{core}"), &format!("witness, core {core}: latency"), late),
-                    Quantity::new(&format!("work_{core}"), &format!("witness, core {core}: fixed work"), work),
+                    Quantity::new(
+                        &format!("witness_{core}"),
+                        &format!("witness, core {core}: latency"),
+                        late,
+                    ),
+                    Quantity::new(
+                        &format!("work_{core}"),
+                        &format!("witness, core {core}: fixed work"),
+                        work,
+                    ),
                 ]
             })
             .collect(),
@@ -335,7 +347,8 @@ fn loop_figures(scenario: &Scenario, run: &LoopRun, load: Option<LoadDone>) -> L
         }),
         allocations_per_cycle_max: run.cycles.iter().map(|cycle| cycle.allocations).max().unwrap_or(0),
         plant_pauses: plant.and_then(|plant| plant.plant_pauses).unwrap_or(0),
-        fallback_level_max: controller.map_or(FallbackLevel::ZeroTorque as u32, |part| part.fallback_level_max),
+        fallback_level_max: controller
+            .map_or(FallbackLevel::ZeroTorque as u32, |part| part.fallback_level_max),
         watchdog_level_max: plant.map_or(FallbackLevel::ZeroTorque as u32, |part| part.watchdog_level_max),
         fell: plant.is_none_or(|plant| plant.robot.fell),
         load,
@@ -362,7 +375,11 @@ fn controller_quantities(cycles: &[CycleRecord], accounts: &[Account], period_ns
         "controller: tick to command sent",
         cycles.iter().map(|cycle| cycle.sent_ns - cycle.due_ns),
     ));
-    list.push(Quantity::new("jitter", "controller: period jitter", jitter(cycles.iter().map(|c| c.begin_ns), period_ns)));
+    list.push(Quantity::new(
+        "jitter",
+        "controller: period jitter",
+        jitter(cycles.iter().map(|c| c.begin_ns), period_ns),
+    ));
     // Each state once: a cycle without a new one answers an old one again.
     let fresh = cycles.windows(2).filter(|pair| pair[0].state_sequence != pair[1].state_sequence);
     let waited = fresh.map(|pair| pair[1].begin_ns.saturating_sub(pair[1].state_sent_ns));
@@ -380,10 +397,18 @@ fn plant_quantities(steps: &[StepRecord], step_ns: u64) -> Vec<Quantity> {
     let woken = woken.map(|(_, step)| step);
     let answered = || steps.iter().filter(|step| step.age_ns > 0);
     vec![
-        Quantity::new("plant_wake_up", "plant: wake-up latency", woken.map(|step| step.woke_ns - step.due_ns)),
+        Quantity::new(
+            "plant_wake_up",
+            "plant: wake-up latency",
+            woken.map(|step| step.woke_ns - step.due_ns),
+        ),
         of("plant_step", "plant: step", |step| step.end_ns - step.begin_ns),
         of("plant_publish", "plant: publish", |step| step.sent_ns - step.end_ns),
-        Quantity::new("plant_jitter", "plant: period jitter", jitter(steps.iter().map(|s| s.begin_ns), step_ns)),
+        Quantity::new(
+            "plant_jitter",
+            "plant: period jitter",
+            jitter(steps.iter().map(|s| s.begin_ns), step_ns),
+        ),
         Quantity::new(
             "command_waited",
             "command sent to step begun",

@@ -49,14 +49,14 @@ pub fn table(report: &TimingReport) -> String {
     }
     if let Some(transport) = &report.transport {
         head(&mut text, "transport between two processes that poll");
-        for (name, figures) in [
-            ("flag in shared memory, round trip: floor", &transport.flag_round_trip),
-            ("state and state, round trip", &transport.state_round_trip),
-            ("state, one way", &transport.state_one_way),
-            ("state and command, round trip", &transport.command_round_trip),
-            ("command, one way", &transport.command_one_way),
+        for quantity in [
+            &transport.flag_round_trip,
+            &transport.state_round_trip,
+            &transport.state_one_way,
+            &transport.command_round_trip,
+            &transport.command_one_way,
         ] {
-            row(&mut text, name, figures.as_ref());
+            row(&mut text, &quantity.name, quantity.figures.as_ref());
         }
     }
     text.push('\n');
@@ -84,7 +84,10 @@ fn one_loop(text: &mut String, figures: &LoopFigures) {
     for Quantity { name, figures, .. } in figures.quantities.iter().chain(&figures.witnesses) {
         row(text, name, figures.as_ref());
     }
-    let by = Cause::ALL.into_iter().zip(figures.missed_by).map(|(cause, count)| format!("{count} {}", cause.name()));
+    let by = Cause::ALL
+        .into_iter()
+        .zip(figures.missed_by)
+        .map(|(cause, count)| format!("{count} {}", cause.name()));
     let by: Vec<String> = by.collect();
     let _ = writeln!(
         text,

@@ -16,8 +16,9 @@ use delmpc_scenario::ProcessSettings;
 use delmpc_transport::{Channel, Payload, Publisher, RunId, RunNode, Subscriber, remove_leftovers};
 use serde::Serialize;
 
-use crate::timing::figures::{Figures, Times};
-use crate::timing::loop_phase::fresh_run;
+use crate::supervisor::fresh_run;
+use crate::timing::figures::Times;
+use crate::timing::phases::Quantity;
 use crate::timing::raw_flag::RawFlag;
 use crate::verdict::{Ended, Failure};
 
@@ -52,15 +53,15 @@ pub struct TransportPeerArguments {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TransportReport {
     /// Round trip of a flag: the floor.
-    pub flag_round_trip: Option<Figures>,
+    pub flag_round_trip: Quantity,
     /// Round trip of a state answered by a state, 1000 bytes each way.
-    pub state_round_trip: Option<Figures>,
+    pub state_round_trip: Quantity,
     /// One way of a state.
-    pub state_one_way: Option<Figures>,
+    pub state_one_way: Quantity,
     /// Round trip of a state answered by a command.
-    pub command_round_trip: Option<Figures>,
+    pub command_round_trip: Quantity,
     /// One way of a command, 18 104 bytes.
-    pub command_one_way: Option<Figures>,
+    pub command_one_way: Quantity,
     /// Median round trip of a state over that of the flag.
     pub ratio_to_flag: Option<f64>,
 }
@@ -89,11 +90,11 @@ pub fn measure(settings: &TransportSettings) -> Result<TransportReport, Failure>
     let median = |times: &Times| times.at_ns(0.5).map(|ns| ns as f64);
     let ratio = median(&state).zip(median(&flag)).map(|(state, flag)| state / flag);
     Ok(TransportReport {
-        flag_round_trip: flag.figures(),
-        state_round_trip: state.figures(),
-        state_one_way: state_ways.figures(),
-        command_round_trip: command.figures(),
-        command_one_way: command_ways.figures(),
+        flag_round_trip: Quantity::of("flag_round_trip", "flag in shared memory, round trip: floor", &flag),
+        state_round_trip: Quantity::of("state_round_trip", "state and state, round trip", &state),
+        state_one_way: Quantity::of("state_one_way", "state, one way", &state_ways),
+        command_round_trip: Quantity::of("command_round_trip", "state and command, round trip", &command),
+        command_one_way: Quantity::of("command_one_way", "command, one way", &command_ways),
         ratio_to_flag: ratio,
     })
 }

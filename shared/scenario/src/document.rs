@@ -259,7 +259,8 @@ fn merge(table: &mut Table, changes: Table) {
 /// The allowed words of a key that takes one of a few.
 fn words(key: &str) -> Option<&'static [&'static str]> {
     // In a list too: `fault[3].kind`.
-    let of_list = key.split_once('[').zip(key.split_once("].")).map(|((list, _), (_, name))| join(list, name));
+    let of_list =
+        key.split_once('[').zip(key.split_once("].")).map(|((list, _), (_, name))| join(list, name));
     match of_list.as_deref().unwrap_or(key) {
         "fault.kind" => Some(&FAULT_KINDS),
         "fault.target" => Some(&["state", "command", "plant", "controller", "machine"]),

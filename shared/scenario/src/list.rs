@@ -10,7 +10,9 @@ enum OneOrMany<T> {
 }
 
 /// Reads `[push]` as a list of one.
-pub(crate) fn deserialize<'de, T: Deserialize<'de>, D: Deserializer<'de>>(from: D) -> Result<Vec<T>, D::Error> {
+pub(crate) fn deserialize<'de, T: Deserialize<'de>, D: Deserializer<'de>>(
+    from: D,
+) -> Result<Vec<T>, D::Error> {
     Ok(match OneOrMany::deserialize(from)? {
         OneOrMany::Many(list) => list,
         OneOrMany::One(one) => vec![one],
