@@ -14,12 +14,15 @@ use delmpc_controller_process::stop::StopFlag;
 use delmpc_messages::FallbackLevel;
 use delmpc_scenario::{FaultKind, FaultSettings, FaultTarget};
 
-/// Long enough to fall after the longest fault.
-const DURATION: &str = "duration_s=1.6";
+/// Sooner and shorter than in the file, and still long enough to fall after the longest fault.
+const START_S: f64 = 0.2;
+const DURATION: &str = "duration_s=1.0";
 
 fn setup() -> Setup {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(FAULT_SCENARIO);
-    Setup::read(&file, &[DURATION.to_owned()]).unwrap()
+    let mut setup = Setup::read(&file, &[DURATION.to_owned()]).unwrap();
+    setup.scenario.fault.iter_mut().for_each(|fault| fault.start_s = START_S);
+    setup
 }
 
 /// All trials of some faults, as many at a time as there are cores.
@@ -86,7 +89,7 @@ fn every_fault_of_messages_is_stood_on_the_first_rungs() {
 #[test]
 fn a_long_silence_leads_down_the_ladder() {
     let setup = setup();
-    let silent = |target| FaultSettings { count: 1000, target, ..FaultSettings::default() };
+    let silent = |target| FaultSettings { count: 1000, target, start_s: START_S, ..FaultSettings::default() };
     let found = trials(&setup, &[silent(FaultTarget::Command), silent(FaultTarget::State)]);
     let [commands, states] = &found[..] else { panic!("{found:?}") };
     // The plant's watchdog steps in for the commands, the controller's ladder for the states.
