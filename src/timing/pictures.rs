@@ -41,7 +41,8 @@ impl Sheet for Canvas {
     }
 
     fn text(&mut self, at: [f32; 2], align: Align, size: Text, text: &str, with: Colour) {
-        Canvas::text(self, at, align, size, text, with);
+        // The letters of the canvas are those of English.
+        Canvas::text(self, at, align, size, &text.replace('µ', "u"), with);
     }
 }
 
