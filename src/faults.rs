@@ -196,7 +196,7 @@ mod tests {
     fn lost_states_leave_the_last_one_and_faults_add_up() {
         let lost = fault(FaultKind::Lost, FaultTarget::State, 0.01, 2);
         let times = |faults: &[FaultSettings]| seen(faults).iter().map(|seen| seen.1).collect::<Vec<_>>();
-        assert_eq!(times(&[lost.clone()]), [0, 1000, 1000, 1000, 4000, 5000]);
+        assert_eq!(times(std::slice::from_ref(&lost)), [0, 1000, 1000, 1000, 4000, 5000]);
         let future = fault(FaultKind::Future, FaultTarget::State, 0.02, 1);
         // The second link counts the messages that come to it.
         assert_eq!(times(&[future, lost]), [0, 1000, 1000, 1000, 5000, 5000]);

@@ -259,14 +259,16 @@ pub fn accounts(cycles: &[CycleRecord], evidence: &Evidence<'_>) -> Vec<Account>
             false => (cycle.woke_ns - cycle.due_ns, 0),
         };
         last_sent_ns = cycle.sent_ns;
+        let taken_ns = off_core_ns.max(stalled_ns);
         Account {
             late_ns,
             backlog_ns,
             wall_ns: cycle.sent_ns - cycle.woke_ns,
-            taken_ns: off_core_ns.max(stalled_ns),
+            taken_ns,
             plant_ns,
             slowness: slowest_ns.map_or(1.0, |slowest_ns| slowest_ns as f64 / usual_ns),
-            pace: fixed_ns(cycle) as f64 / usual_fixed_ns,
+            // As if all that was taken had been taken from them.
+            pace: fixed_ns(cycle).saturating_sub(taken_ns + plant_ns) as f64 / usual_fixed_ns,
         }
     };
     cycles.iter().map(account).collect()

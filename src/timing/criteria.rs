@@ -86,17 +86,17 @@ fn loop_criteria(
     let same =
         |floor: &&FloorFigures| floor.loaded == figures.loaded && floor.core == measured.controller_core;
     if let Some(floor) = measured.occupied.iter().find(same) {
-        let share = machine as f64 / figures.cycles.max(1) as f64;
+        let share = machine as f64 / figures.deadlines.max(1) as f64;
         let of_floor = if machine == 0 { 0.0 } else { share / floor.missed_share() };
-        let (loop_misses, floor_misses) = ((machine, figures.cycles), (floor.missed, floor.deadlines()));
+        let (loop_misses, floor_misses) = ((machine, figures.deadlines), (floor.missed, floor.deadlines));
         let chance = chance_of_so_many(loop_misses, floor_misses, settings.misses_of_floor);
         list.push(Criterion {
             kept: of_floor <= settings.misses_of_floor || chance >= SIGNIFICANCE,
             note: format!(
-                "{machine} of {} cycles, floor {} of {}; chance of so many if the limit were kept: {chance:.2}",
-                figures.cycles,
+                "{machine} of {} deadlines, floor {} of {}; chance of so many if the limit were kept: {chance:.2}",
+                figures.deadlines,
                 floor.missed,
-                floor.deadlines()
+                floor.deadlines
             ),
             ..at_most(
                 "timing.misses_of_floor",

@@ -190,6 +190,11 @@ pub fn overlap(stalls: &[[u64; 2]], [begin, end]: [u64; 2]) -> u64 {
     shared.map(|stall| stall[1].min(end).saturating_sub(stall[0].max(begin))).sum()
 }
 
+/// Ticks, those slept through included.
+pub fn deadlines(ticks: &[FloorTick]) -> u64 {
+    ticks.iter().map(|tick| 1 + tick.missed).sum()
+}
+
 /// Ticks that were late by a whole period when their work was done, and those slept through.
 pub fn missed_deadlines(ticks: &[FloorTick], period_ns: u64) -> u64 {
     ticks.iter().map(|tick| tick.missed + u64::from(tick.done_ns > tick.due_ns + period_ns)).sum()
@@ -252,6 +257,7 @@ mod tests {
     #[test]
     fn deadlines_of_a_thread_are_those_it_slept_through_and_those_it_overran() {
         let tick = |due_ns, done_ns, missed| FloorTick { due_ns, woke_ns: due_ns, done_ns, missed };
-        assert_eq!(missed_deadlines(&[tick(0, 50, 0), tick(100, 201, 0), tick(300, 310, 1)], 100), 2);
+        let ticks = [tick(0, 50, 0), tick(100, 201, 0), tick(300, 310, 1)];
+        assert_eq!((missed_deadlines(&ticks, 100), deadlines(&ticks)), (2, 4));
     }
 }

@@ -13,7 +13,7 @@ use crate::supervisor::Course;
 use crate::timing::attribution::{Account, Cause, Evidence, Miss, Stage, Witness, accounts, misses};
 use crate::timing::co_load::{CoLoad, LoadDone};
 use crate::timing::figures::{Bar, Figures, Times};
-use crate::timing::floor::{FloorRun, FloorSettings, FloorThread, Work, missed_deadlines, stalls};
+use crate::timing::floor::{FloorRun, FloorSettings, FloorThread, Work, deadlines, missed_deadlines, stalls};
 use crate::timing::loop_phase::{LoopRun, cores_of, run_loop};
 use crate::verdict::Failure;
 
@@ -56,6 +56,8 @@ pub struct FloorFigures {
     pub wake_up: Quantity,
     /// Ticks that were late by `event_s` or more.
     pub events: u64,
+    /// Deadlines it had.
+    pub deadlines: u64,
     /// Deadlines it missed: ticks not done a period later, and ticks slept through.
     pub missed: u64,
     /// Whether it had a real-time priority.
@@ -65,12 +67,7 @@ pub struct FloorFigures {
 impl FloorFigures {
     /// Part of the deadlines it missed.
     pub fn missed_share(&self) -> f64 {
-        self.missed as f64 / self.deadlines().max(1) as f64
-    }
-
-    /// Deadlines it had.
-    pub fn deadlines(&self) -> u64 {
-        self.wake_up.figures.map_or(0, |figures| figures.count)
+        self.missed as f64 / self.deadlines.max(1) as f64
     }
 }
 
@@ -93,6 +90,8 @@ pub struct LoopFigures {
     pub compute_spread: Option<f64>,
     /// The longest a cycle itself computed (s).
     pub own_time_max_s: f64,
+    /// Deadlines: cycles, and ticks that were slept through.
+    pub deadlines: u64,
     /// Deadlines missed.
     pub missed: u64,
     /// Of these, in the order of [`Cause::ALL`].
@@ -232,6 +231,10 @@ impl Phases<'_> {
         self.warn("", &run.warnings);
         for (_, witness) in &run.witnesses {
             self.warn("witness", &witness.warnings);
+            if !witness.realtime {
+                let what = "it can be held up by the loop: what it cannot prove counts as the software's";
+                self.warn("witness", &[what.to_owned()]);
+            }
         }
         Ok(loop_figures(&setup.scenario, &run, done))
     }
@@ -263,6 +266,7 @@ fn floor_figures(
         period_s,
         wake_up: Quantity::new("wake_up", &name, late()),
         events: late().filter(|late| *late >= event_ns).count() as u64,
+        deadlines: deadlines(&run.ticks),
         missed: missed_deadlines(&run.ticks, ns(period_s)),
         realtime: run.realtime,
     }
@@ -330,6 +334,7 @@ fn loop_figures(scenario: &Scenario, run: &LoopRun, load: Option<LoadDone>) -> L
         disturbed_cycles: accounts.iter().filter(disturbed).count() as u64,
         compute_spread: spread,
         own_time_max_s: accounts.iter().map(Account::own_ns).max().unwrap_or(0) as f64 * 1e-9,
+        deadlines: run.cycles.iter().map(|cycle| 1 + u64::from(cycle.missed_ticks)).sum(),
         missed: missed_by.iter().sum(),
         missed_by,
         misses,

@@ -10,7 +10,7 @@ use crate::verdict::Failure;
 
 const SIZE: [f32; 2] = [1400.0, 620.0];
 const LEFT: f32 = 118.0;
-const RIGHT: f32 = 28.0;
+const RIGHT: f32 = 56.0;
 const TOP: f32 = 124.0;
 const BOTTOM: f32 = 70.0;
 

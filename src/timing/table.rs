@@ -39,7 +39,7 @@ pub fn table(report: &TimingReport) -> String {
             1e3 * floor.work_s,
             1e3 * floor.period_s,
             floor.missed,
-            floor.deadlines()
+            floor.deadlines
         );
     }
     for figures in &report.loops {
@@ -91,10 +91,11 @@ fn one_loop(text: &mut String, figures: &LoopFigures) {
     let by: Vec<String> = by.collect();
     let _ = writeln!(
         text,
-        "  {} cycles, {} disturbed by the machine; {} deadlines missed: {}",
+        "  {} cycles, {} disturbed by the machine; {} of {} deadlines missed: {}",
         figures.cycles,
         figures.disturbed_cycles,
         figures.missed,
+        figures.deadlines,
         by.join(", ")
     );
     let _ = writeln!(text, "  longest a cycle itself computed: {:.3} ms", 1e3 * figures.own_time_max_s);
