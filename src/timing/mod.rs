@@ -11,7 +11,7 @@
 //! With `--faults` it runs every fault of a scenario instead ([`campaign`]).
 //!
 //! Files: [`floor`], [`co_load`], [`transport`] measure; [`loop_phase`] runs the processes; [`attribution`] finds who missed a deadline;
-//! [`phases`] makes figures, [`criteria`] judges, [`mod@table`] and [`pictures`] show. What the operating system refuses is a warning, and the
+//! [`phases`] makes figures, [`mod@criteria`] judges, [`mod@table`] and [`pictures`] show. What the operating system refuses is a warning, and the
 //! thresholds relative to the floor still hold.
 
 pub mod attribution;
@@ -49,7 +49,7 @@ const MESSAGES: u64 = 50_000;
 /// Arguments of `delmpc timing`.
 #[derive(Debug, Clone, clap::Args)]
 pub struct TimingArguments {
-    /// Scenario file [default: configs/scenarios/atlas_one_foot.toml; with --faults configs/scenarios/atlas_faults.toml]; its [timing] has
+    /// Scenario file [default: configs/scenarios/atlas_one_foot.toml; with --faults configs/scenarios/atlas_faults.toml]; its table `timing` has
     /// the thresholds
     pub scenario: Option<PathBuf>,
     /// Override a key of the scenario, for example --set timing.compute_spread=2
@@ -70,7 +70,7 @@ pub struct TimingArguments {
     /// Leave out the phases with co-load
     #[arg(long)]
     pub no_load: bool,
-    /// Run every [[fault]] of the scenario instead, each in a run of its own: ladder levels and the robot's fate
+    /// Run every fault of the scenario instead, each in a run of its own: ladder levels and the robot's fate
     #[arg(long, conflicts_with_all = ["duration", "one_core", "no_load"])]
     pub faults: bool,
     /// With --faults: the fault that moves the machine's wall clock for a moment may do so
