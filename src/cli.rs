@@ -9,6 +9,8 @@ use crate::model::ModelArguments;
 use crate::push_map::PushMapArguments;
 use crate::replay::ReplayArguments;
 use crate::report::ReportArguments;
+use crate::timing::TimingArguments;
+use crate::timing::transport::TransportPeerArguments;
 
 /// What `--help` shows at its end.
 const EXAMPLES: &str = "\
@@ -19,6 +21,7 @@ Examples:
   delmpc run configs/scenarios/atlas_one_foot.toml --set clock=lockstep --json
   delmpc model configs/robots/atlas.urdf
   delmpc push-map --controller mpc,static-lqr --directions 8
+  delmpc timing --duration 10
   delmpc replay runs/latest --verify
   delmpc help run                               everything about a subcommand
 
@@ -94,6 +97,14 @@ Examples:
   echo '{\"q\": {\"r_leg_kny\": 0.9}, \"dt\": 0.005}' > at.json
   delmpc model configs/robots/atlas.urdf --at at.json       A, B, mass matrix, step as JSON";
 
+const TIMING_EXAMPLES: &str = "\
+Examples:
+  delmpc timing                                       60 s alone and 60 s under co-load, plant on core 0, controller on core 1
+  delmpc timing --duration 10 --cores 2,3
+  delmpc timing --one-core --set controller.mpc_rate_hz=100
+  delmpc timing --no-rt                               without privileges, by the thresholds relative to the floor
+  delmpc timing --faults                              every fault of configs/scenarios/atlas_faults.toml";
+
 const COMPLETIONS_EXAMPLES: &str = "\
 Examples:
   delmpc completions bash > ~/.local/share/bash-completion/completions/delmpc
@@ -148,6 +159,15 @@ pub enum Command {
     /// push_map.json and push_map.svg.
     #[command(after_long_help = PUSH_MAP_EXAMPLES)]
     PushMap(PushMapArguments),
+    /// Certify the timing of the loop on two cores: the machine's floor first, then the loop, then the loop under stress
+    ///
+    /// Every missed deadline is followed to its cause: the machine, or the stage of the software. The thresholds are those of the
+    /// scenario; exit status 3 when one is broken. What the operating system does not permit is a warning.
+    #[command(after_long_help = TIMING_EXAMPLES)]
+    Timing(TimingArguments),
+    /// The other end of the transport measurement
+    #[command(hide = true)]
+    TransportPeer(TransportPeerArguments),
     /// Run again from the log of a run and compare bit by bit
     ///
     /// The plant is given every logged command where it came; each state and truth must come out as logged. In lockstep the
@@ -222,6 +242,9 @@ pub struct PartArguments {
     /// A supervisor starts, watches and ends this process
     #[arg(long, hide = true)]
     pub supervised: bool,
+    /// Leave the times of every cycle or step, and no log
+    #[arg(long, hide = true, requires = "out")]
+    pub timing: bool,
     /// Standard input says what a person does to the plant
     #[arg(long, hide = true)]
     pub steered: bool,

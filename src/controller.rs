@@ -8,9 +8,12 @@ use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::Channel;
 
 use crate::cli::PartArguments;
-use crate::part::{Supervisor, ended, leave_part, message_run_id, prepare_machine, run_id, say};
+use crate::faults::FaultyController;
+use crate::part::{
+    Supervisor, ended, leave_part, leave_records, message_run_id, prepare_machine, run_id, say,
+};
 use crate::robot_controller::RobotController;
-use crate::run_folder::CONTROLLER_PART;
+use crate::run_folder::{CONTROLLER_PART, CYCLE_RECORDS};
 use crate::setup::Setup;
 use crate::summary::ControllerPart;
 use crate::verdict::{Ended, Failure};
@@ -24,13 +27,14 @@ pub fn controller(arguments: &PartArguments, allocations: fn() -> u64) -> Result
     let setup = Setup::read(&arguments.scenario, &arguments.set)?;
     let scenario = &setup.scenario;
     let run = run_id(arguments, &setup)?;
-    let mut controller = RobotController::new(&setup)?;
+    let controller = RobotController::new(&setup)?;
     let allowed_m = scenario.success.hand_error_at_deadline_m;
     if let Some(distance_m) = controller.out_of_reach_m().filter(|distance_m| *distance_m > allowed_m) {
         say(&format!(
             "warning: no balanced posture brings the hand nearer to the ball than {distance_m:.3} m: move `reach.ball_m`"
         ));
     }
+    let mut controller = FaultyController::new(controller, scenario);
     prepare_machine(Role::Controller, scenario);
 
     let hash = setup.joint_set_hash();
@@ -47,10 +51,16 @@ pub fn controller(arguments: &PartArguments, allocations: fn() -> u64) -> Result
     if scenario.clock == Clock::Realtime {
         controller_loop = controller_loop.counting(allocations);
     }
-    let (ending, figures) = controller_loop.run(&mut controller, &mut membership).map_err(Failure::fault)?;
+    if arguments.timing {
+        controller_loop = controller_loop.recording();
+    }
+    let (ending, figures, records) =
+        controller_loop.run(&mut controller, &mut membership).map_err(Failure::fault)?;
     drop(membership);
     supervisor.stand_in(run);
-    leave_part(arguments.out.as_deref(), CONTROLLER_PART, &part(scenario, &figures))?;
+    let folder = arguments.out.as_deref();
+    leave_records(folder, CYCLE_RECORDS, &records)?;
+    leave_part(folder, CONTROLLER_PART, &part(scenario, &figures))?;
     ended(ending, "plant")
 }
 

@@ -9,6 +9,7 @@
 //! | [`verdict`] | how a command ends: exit status and message |
 //! | [`setup`] | scenario and robot from their files, checked against each other |
 //! | [`simulated_robot`], [`robot_controller`] | plant and controller made from a setup |
+//! | [`faults`] | faults of messages on purpose |
 //! | [`run_folder`] | the folder a run leaves behind |
 //! | [`supervisor`] | starts, watches and ends the two processes |
 //! | [`part`] | what the two processes have in common |
@@ -24,6 +25,7 @@
 //! | [`mod@report`] | the run to look at: `report.html` and pictures of the key plots |
 //! | [`steering`] | what a person does to a running plant |
 //! | [`view`] | the live page: watch, pull, pause |
+//! | [`timing`] | the timing of the loop certified: figures, causes of missed deadlines, verdict |
 //! | [`status_line`] | one line about the running run |
 
 pub mod cli;
@@ -31,6 +33,7 @@ pub mod colour;
 pub mod completions;
 pub mod controller;
 pub mod drawing;
+pub mod faults;
 pub mod log;
 pub mod log_viewer;
 pub mod metrics;
@@ -55,6 +58,7 @@ pub mod steering;
 pub mod summary;
 pub mod summary_table;
 pub mod supervisor;
+pub mod timing;
 pub mod truth;
 pub mod verdict;
 pub mod view;

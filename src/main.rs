@@ -23,6 +23,8 @@ fn main() -> ExitCode {
         Command::PushMap(arguments) => delmpc::push_map::push_map(&arguments),
         Command::Replay(arguments) => delmpc::replay::replay(&arguments),
         Command::Completions(arguments) => delmpc::completions::completions(&arguments),
+        Command::Timing(arguments) => delmpc::timing::timing(&arguments),
+        Command::TransportPeer(arguments) => delmpc::timing::transport::transport_peer(&arguments),
         Command::Report(arguments) => delmpc::report::report(&arguments),
     })
 }

@@ -55,6 +55,9 @@ pub struct RobotFigures {
     pub max_friction_use: Option<f64>,
     /// Largest torque relative to its limit.
     pub max_torque_ratio: f64,
+    /// Steps in which a torque was no number or infinite.
+    #[serde(default)]
+    pub steps_with_non_finite_torque: u64,
     /// Distance of hand and ball at the deadline.
     pub hand_error_at_deadline_m: Option<f64>,
     /// Largest distance of hand and ball while holding.
@@ -96,6 +99,7 @@ impl Metrics {
                 min_cop_margin_m: None,
                 max_friction_use: None,
                 max_torque_ratio: 0.0,
+                steps_with_non_finite_torque: 0,
                 hand_error_at_deadline_m: None,
                 hand_error_hold_max_m: None,
                 recovered: None,
@@ -127,6 +131,8 @@ impl Metrics {
         lower(&mut figures.min_cop_margin_m, truth.cop_margin_m);
         raise(&mut figures.max_friction_use, truth.friction_use);
         figures.max_torque_ratio = figures.max_torque_ratio.max(truth.torque_ratio);
+        let torque = &truth.torque[..truth.torque.len().min(truth.n_joints as usize)];
+        figures.steps_with_non_finite_torque += u64::from(torque.iter().any(|torque| !torque.is_finite()));
         raise(&mut figures.energy_balance_error, truth.energy_balance_error);
 
         if let Some(ball) = self.ball {
@@ -260,6 +266,19 @@ mod tests {
         let figures = metrics.figures();
         assert_eq!((figures.fell, figures.fall_time_s), (true, Some(2.0)));
         assert_eq!((figures.recovered, figures.settle_time_s), (Some(false), None));
+    }
+
+    #[test]
+    fn a_torque_that_is_no_number_is_counted_and_what_lies_beyond_the_joints_is_not() {
+        let mut metrics = Metrics::new(&scenario());
+        for (k, (joint, torque)) in
+            [(0, 1.0), (0, f64::NAN), (0, f64::INFINITY), (1, f64::NAN)].into_iter().enumerate()
+        {
+            let mut truth = truth(k as u64);
+            truth.torque[joint] = torque;
+            metrics.observe(&truth);
+        }
+        assert_eq!(metrics.figures().steps_with_non_finite_torque, 2);
     }
 
     #[test]

@@ -10,6 +10,7 @@ use delmpc_messages::{Command, PlantState};
 use delmpc_transport::{LinkError, Publisher, RunId, Subscriber, in_process_link};
 
 use crate::controller::part;
+use crate::faults::{FaultyController, FaultyPlant};
 use crate::log::Log;
 use crate::part::{leave_part, message_run_id};
 use crate::plant::log_head;
@@ -58,21 +59,22 @@ pub enum Simulated {
 /// As [`run_in_one_process`].
 pub fn simulate(setup: &Setup, log: Log, stop: &StopFlag) -> Result<Simulated, Failure> {
     let scenario = &setup.scenario;
-    let mut robot = SimulatedRobot::new(setup)?;
+    let mut robot = FaultyPlant::new(SimulatedRobot::new(setup)?, scenario);
     let (run, hash) = (message_run_id(RunId(0), scenario), setup.joint_set_hash());
     let joints = setup.robot.joint_names.len() as u32;
     let (states, states_in) = in_process_link::<PlantState>();
     let (commands, commands_in) = in_process_link::<Command>();
     let controller_loop =
         ControllerLoop::new(scenario, states_in, commands, &Command::new(run, hash, joints));
-    let mut answers =
-        Answers { controller_loop, controller: RobotController::new(setup)?, commands: commands_in };
+    let controller = FaultyController::new(RobotController::new(setup)?, scenario);
+    let mut answers = Answers { controller_loop, controller, commands: commands_in };
     let blank = PlantState::new(run, hash, joints);
     let plant_loop = PlantLoop::new(scenario, states, &mut answers, &blank, log);
     match plant_loop.run(&mut robot, &mut Alone(stop.clone())) {
         Err(fault) => Ok(Simulated::Fault(fault.to_string())),
-        Ok((_, mut plant, log)) => {
-            plant.log_records_dropped = log.finish()?;
+        Ok(run) => {
+            let mut plant = run.part;
+            plant.log_records_dropped = run.log.finish()?;
             let figures = answers.controller_loop.figures().clone();
             Ok(Simulated::Ended { plant: Box::new(plant), figures })
         }
@@ -82,7 +84,7 @@ pub fn simulate(setup: &Setup, log: Log, stop: &StopFlag) -> Result<Simulated, F
 /// The plant's end of a link whose other end is a controller that answers when asked.
 struct Answers<'a, S, P, C> {
     controller_loop: ControllerLoop<'a, S, P>,
-    controller: RobotController,
+    controller: FaultyController<RobotController>,
     commands: C,
 }
 

@@ -3,9 +3,11 @@
 use std::io::Write;
 use std::path::Path;
 
+use bytemuck::Pod;
 use delmpc_controller_process::controller_loop::Ending;
 use delmpc_controller_process::machine::prepare;
 use delmpc_controller_process::membership::Order;
+use delmpc_controller_process::records::Records;
 use delmpc_messages::{JointSetHasher, Role};
 use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::{RunId, remove_leftovers};
@@ -41,11 +43,17 @@ pub fn message_run_id(run: RunId, scenario: &Scenario) -> u64 {
 /// Asks the operating system for what the scenario wants, and says what it refused. Lockstep asks for nothing.
 pub fn prepare_machine(role: Role, scenario: &Scenario) {
     if scenario.clock == Clock::Realtime {
+        let mut process = scenario.process.clone();
         let core = match role {
-            Role::Plant => scenario.process.plant_core,
-            _ => scenario.process.controller_core,
+            Role::Plant => process.plant_core,
+            _ => process.controller_core,
         };
-        for warning in prepare(&scenario.process, core) {
+        // Rate-monotonic, for the case that both share a core. Source: Liu, Layland, "Scheduling algorithms for multiprogramming in a
+        // hard-real-time environment", J. ACM 20, 1973.
+        if role == Role::Plant && process.priority > 0 {
+            process.priority = (process.priority + 1).min(99);
+        }
+        for warning in prepare(&process, core) {
             say(&format!("warning: {warning}"));
         }
     }
@@ -94,6 +102,20 @@ pub fn leave_part(folder: Option<&Path>, name: &str, part: &impl Serialize) -> R
             moved.map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))
         }
     }
+}
+
+/// Leaves the records of a loop in the run's folder; nothing when none were kept.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn leave_records<R: Pod>(folder: Option<&Path>, name: &str, records: &Records<R>) -> Result<(), Failure> {
+    let Some(folder) = folder.filter(|_| records.are_kept()) else { return Ok(()) };
+    if records.lost() > 0 {
+        say(&format!("warning: no room for {} of the records in {name}", records.lost()));
+    }
+    let file = folder.join(name);
+    std::fs::write(&file, records.bytes())
+        .map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))
 }
 
 /// What the ending of a loop means for the process.

@@ -9,11 +9,14 @@ use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::{Channel, RunId};
 
 use crate::cli::PartArguments;
+use crate::faults::FaultyPlant;
 use crate::log::{Log, LogHead};
 use crate::log_viewer::LogViewer;
-use crate::part::{Supervisor, ended, leave_part, message_run_id, prepare_machine, run_id, say};
-use crate::plant_process::PlantLoop;
-use crate::run_folder::{PLANT_PART, ROBOT_FILE};
+use crate::part::{
+    Supervisor, ended, leave_part, leave_records, message_run_id, prepare_machine, run_id, say,
+};
+use crate::plant_process::{PlantLoop, PlantRun};
+use crate::run_folder::{PLANT_PART, ROBOT_FILE, STEP_RECORDS};
 use crate::setup::Setup;
 use crate::simulated_robot::SimulatedRobot;
 use crate::steering::Steering;
@@ -28,12 +31,12 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
     let setup = Setup::read(&arguments.scenario, &arguments.set)?;
     let scenario = &setup.scenario;
     let run = run_id(arguments, &setup)?;
-    let mut robot = SimulatedRobot::new(&setup)?;
+    let mut robot = FaultyPlant::new(SimulatedRobot::new(&setup)?, scenario);
     let log = match &arguments.out {
-        Some(folder) => {
+        Some(folder) if !arguments.timing => {
             Log::create(&folder.join("log.mcap"), log_head(&setup, run), scenario.clock == Clock::Lockstep)?
         }
-        None => Log::none(),
+        _ => Log::none(),
     };
     prepare_machine(Role::Plant, scenario);
 
@@ -52,12 +55,18 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
         true => Steering::by_lines(BufReader::new(std::io::stdin()), setup.robot.tree.body_count()),
         false => Steering::none(),
     };
-    let plant_loop = PlantLoop::new(scenario, states, commands, &blank, log).steered(steering);
-    let (ending, mut part, log) = plant_loop.run(&mut robot, &mut membership).map_err(Failure::fault)?;
+    let mut plant_loop = PlantLoop::new(scenario, states, commands, &blank, log).steered(steering);
+    if arguments.timing {
+        plant_loop = plant_loop.recording();
+    }
+    let PlantRun { ending, mut part, log, records } =
+        plant_loop.run(&mut robot, &mut membership).map_err(Failure::fault)?;
     part.log_records_dropped = log.finish()?;
     drop(membership);
     supervisor.stand_in(run);
-    leave_part(arguments.out.as_deref(), PLANT_PART, &part)?;
+    let folder = arguments.out.as_deref();
+    leave_records(folder, STEP_RECORDS, &records)?;
+    leave_part(folder, PLANT_PART, &part)?;
     ended(ending, "controller")
 }
 

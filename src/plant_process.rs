@@ -20,6 +20,8 @@ use delmpc_controller_process::clock::{monotonic_ns, sleep_until};
 use delmpc_controller_process::controller_loop::Ending;
 use delmpc_controller_process::figures::percentile;
 use delmpc_controller_process::membership::{Attendance, Order};
+use delmpc_controller_process::records::{Records, StepRecord};
+use delmpc_controller_process::usage::Usage;
 use delmpc_messages::{Command, PlantState, ProcessState, status};
 use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::{LinkError, Publisher, Subscriber};
@@ -121,6 +123,22 @@ pub struct PlantLoop<'a, P, S> {
     timing: Timing,
     commands_refused: u64,
     watchdog_level_max: u32,
+    /// Every step with its times, when somebody wants them.
+    records: Records<StepRecord>,
+    /// The command that came last: when it had been sent, and how old its measurement was when it came.
+    arrival: (u64, u64),
+}
+
+/// What a run of the plant leaves behind.
+pub struct PlantRun {
+    /// How it ended.
+    pub ending: Ending,
+    /// The figures.
+    pub part: PlantPart,
+    /// The log, not yet finished.
+    pub log: Log,
+    /// Every step with its times, if they were wanted.
+    pub records: Records<StepRecord>,
 }
 
 /// What the wall clock said.
@@ -160,7 +178,16 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
             },
             commands_refused: 0,
             watchdog_level_max: 0,
+            records: Records::none(),
+            arrival: (0, 0),
         }
+    }
+
+    /// Keeps a record of every step.
+    #[must_use]
+    pub fn recording(mut self) -> Self {
+        self.records = Records::with_capacity(self.scenario.steps() as usize);
+        self
     }
 
     /// Somebody pulls and pauses.
@@ -178,7 +205,7 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
         mut self,
         plant: &mut impl Plant,
         membership: &mut impl Attendance,
-    ) -> Result<(Ending, PlantPart, Log), PlantFault> {
+    ) -> Result<PlantRun, PlantFault> {
         plant.truth(&mut self.truth);
         self.metrics.observe(&self.truth);
         self.log.truth(&self.truth);
@@ -191,7 +218,7 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
         }
         self.say_farewell(plant, membership)?;
         let part = self.part();
-        Ok((ending, part, self.log))
+        Ok(PlantRun { ending, part, log: self.log, records: self.records })
     }
 
     /// Sends the initial state until it is answered, and then until the run may begin.
@@ -238,7 +265,9 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
             }
             let due_ns = self.start_ns + self.time_ns + self.step_ns;
             sleep_until(due_ns);
-            let late_ns = monotonic_ns().saturating_sub(due_ns);
+            let woke_ns = monotonic_ns();
+            let usage = self.records.are_kept().then(Usage::now);
+            let late_ns = woke_ns.saturating_sub(due_ns);
             if late_ns > MOST_CATCH_UP_NS {
                 self.start_ns += late_ns;
                 self.timing.pauses += 1;
@@ -250,12 +279,18 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
             self.receive()?;
             let begin_ns = monotonic_ns();
             let goes_on = self.step(plant)?;
-            self.timing.steps_ns.push(monotonic_ns() - begin_ns);
-            self.timing.end_ns = monotonic_ns();
+            let end_ns = monotonic_ns();
+            self.timing.steps_ns.push(end_ns - begin_ns);
+            self.timing.end_ns = end_ns;
+            if goes_on {
+                self.send_state(plant, 0)?;
+            }
+            if let Some(before) = usage {
+                self.record([due_ns, woke_ns, begin_ns, end_ns], &before);
+            }
             if !goes_on {
                 break;
             }
-            self.send_state(plant, 0)?;
         }
         Ok(Ending::Finished)
     }
@@ -335,12 +370,13 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
         };
         self.queue.push(command);
         let realtime = self.scenario.clock == Clock::Realtime;
-        if realtime
-            && self.timing.ages_ns.len() < self.timing.ages_ns.capacity()
-            && command.state_sequence > 1
-        {
+        if realtime && command.state_sequence > 1 {
             let measured_ns = self.start_ns + command.state_time_ns;
-            self.timing.ages_ns.push(monotonic_ns().saturating_sub(measured_ns));
+            let age_ns = monotonic_ns().saturating_sub(measured_ns);
+            self.arrival = (command.header.sent_at_ns, age_ns);
+            if self.timing.ages_ns.len() < self.timing.ages_ns.capacity() {
+                self.timing.ages_ns.push(age_ns);
+            }
         }
         self.log.command(self.time_ns, command);
         Ok(Some(command.state_sequence))
@@ -363,6 +399,31 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
         self.watchdog_level_max = self.watchdog_level_max.max(self.truth.watchdog_level);
         let fell_s = self.metrics.fall_time_s();
         Ok(fell_s.is_none_or(|fell_s| self.truth.time_s() < fell_s + AFTER_FALL_S))
+    }
+
+    /// Keeps the times of a step: due, woke up, begun, computed.
+    fn record(&mut self, [due_ns, woke_ns, begin_ns, end_ns]: [u64; 4], before: &Usage) {
+        let (command_sent_ns, age_ns) = std::mem::take(&mut self.arrival);
+        let sent_ns = monotonic_ns();
+        let used = Usage::now().since(before);
+        self.records.keep(StepRecord {
+            due_ns,
+            woke_ns,
+            begin_ns,
+            end_ns,
+            sent_ns,
+            cpu_ns: used.cpu_ns,
+            time_ns: self.time_ns,
+            command_sent_ns,
+            age_ns,
+            cop_margin_m: self.truth.cop_margin_m,
+            watchdog_level: self.truth.watchdog_level,
+            status_flags: self.truth.status_flags,
+            minor_faults: used.minor_faults as u32,
+            major_faults: used.major_faults as u32,
+            voluntary_switches: used.voluntary_switches as u32,
+            involuntary_switches: used.involuntary_switches as u32,
+        });
     }
 
     fn send_state(&mut self, plant: &mut impl Plant, extra_flags: u32) -> Result<(), PlantFault> {

@@ -11,6 +11,7 @@ use delmpc_messages::{Command, PlantState, status};
 use delmpc_scenario::Clock;
 use mcap::MessageStream;
 
+use crate::faults::{FaultyController, FaultyPlant};
 use crate::log::{COMMAND, PULL, STATE, TRUTH, read_record};
 use crate::plant_process::{CommandQueue, Plant};
 use crate::robot_controller::RobotController;
@@ -66,9 +67,9 @@ pub fn replay(arguments: &ReplayArguments) -> Result<Ended, Failure> {
 fn compare(setup: &Setup, log: &[u8], file: &Path) -> Result<Result<Compared, String>, Failure> {
     let broken = |error: &dyn std::fmt::Display| Failure::Input(format!("{}: {error}", file.display()));
     let scenario = &setup.scenario;
-    let mut plant = SimulatedRobot::new(setup)?;
+    let mut plant = FaultyPlant::new(SimulatedRobot::new(setup)?, scenario);
     let mut controller = match scenario.clock {
-        Clock::Lockstep => Some(RobotController::new(setup)?),
+        Clock::Lockstep => Some(FaultyController::new(RobotController::new(setup)?, scenario)),
         Clock::Realtime => None,
     };
     let delay_ns = (scenario.sensors.delay_s * 1e9).round() as u64;

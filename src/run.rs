@@ -2,11 +2,10 @@
 
 use std::io::{IsTerminal, Write};
 use std::path::Path;
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use delmpc_controller_process::stop::StopFlag;
 use delmpc_scenario::Clock;
-use delmpc_transport::{RunId, remove_dead_runs};
+use delmpc_transport::remove_dead_runs;
 use serde::de::DeserializeOwned;
 
 use crate::cli::{RunArguments, RunOptions};
@@ -17,7 +16,7 @@ use crate::setup::{Setup, scenario_file};
 use crate::status_line::StatusLine;
 use crate::summary::Summary;
 use crate::summary_table::summary_table;
-use crate::supervisor::{Course, Supervision};
+use crate::supervisor::{Course, Supervision, fresh_run};
 use crate::verdict::{Ended, Failure};
 use crate::view::View;
 
@@ -110,8 +109,7 @@ fn run_in_two_processes(
 ) -> Result<Course, Failure> {
     let talkative = !options.quiet && !options.json;
     remove_dead_runs();
-    let time_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as u64);
-    let run = RunId::from_seeds(time_ns, std::process::id());
+    let run = fresh_run();
     if options.view {
         let opened = view.insert(View::new(setup, options.port)?);
         let _ = writeln!(std::io::stderr(), "open {} to begin", opened.address());
@@ -125,6 +123,8 @@ fn run_in_two_processes(
         steering: view.as_ref().map(View::pipe),
         show_messages: talkative,
         hang_s: setup.scenario.process.hang_s,
+        restarts: 0,
+        late: None,
     };
     let show = talkative && std::io::stderr().is_terminal();
     let mut line = show.then(|| StatusLine::new(setup, run));

@@ -33,6 +33,10 @@ pub const PLOTS_FOLDER: &str = "plots";
 pub const PLANT_PART: &str = "plant.json";
 /// What the controller process found out; part of the summary.
 pub const CONTROLLER_PART: &str = "controller.json";
+/// Times of every cycle, left by the controller process for the timing report.
+pub const CYCLE_RECORDS: &str = "cycles.records";
+/// Times of every step, left by the plant process for the timing report.
+pub const STEP_RECORDS: &str = "steps.records";
 
 /// A run's folder.
 #[derive(Debug, Clone)]
@@ -45,6 +49,7 @@ impl RunFolder {
     ///
     /// # Errors
     /// [`Failure::Input`] when it cannot be made.
+    #[allow(clippy::disallowed_methods, reason = "a name for people, by their clock")]
     pub fn create(named: Option<&Path>, scenario: &str) -> Result<Self, Failure> {
         match named {
             Some(path) => {

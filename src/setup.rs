@@ -10,6 +10,8 @@ use crate::verdict::Failure;
 
 /// The scenario that runs when none is named.
 pub const MAIN_SCENARIO: &str = "configs/scenarios/atlas_one_foot.toml";
+/// The scenario whose faults are tried when none is named.
+pub const FAULT_SCENARIO: &str = "configs/scenarios/atlas_faults.toml";
 
 /// What a run is about.
 #[derive(Debug, Clone)]
@@ -109,18 +111,26 @@ impl Setup {
 /// # Errors
 /// When the main scenario cannot be found.
 pub fn scenario_file(named: Option<&Path>) -> Result<PathBuf, Failure> {
+    scenario_file_or(named, MAIN_SCENARIO)
+}
+
+/// The same with another file where none is named.
+///
+/// # Errors
+/// When that file cannot be found.
+pub fn scenario_file_or(named: Option<&Path>, usual: &str) -> Result<PathBuf, Failure> {
     if let Some(file) = named {
         return Ok(file.to_owned());
     }
-    let here = PathBuf::from(MAIN_SCENARIO);
+    let here = PathBuf::from(usual);
     if here.is_file() {
         return Ok(here);
     }
     let program = std::env::current_exe().unwrap_or_default();
-    let beside = program.ancestors().skip(1).map(|folder| folder.join(MAIN_SCENARIO));
+    let beside = program.ancestors().skip(1).map(|folder| folder.join(usual));
     beside.into_iter().find(|file| file.is_file()).ok_or_else(|| {
         let advice = "run it in the project's folder, or name a scenario: delmpc run FILE";
-        Failure::Input(format!("{MAIN_SCENARIO} is neither here nor above the program: {advice}"))
+        Failure::Input(format!("{usual} is neither here nor above the program: {advice}"))
     })
 }
 

@@ -4,6 +4,7 @@
 //! |---|---|
 //! | both say they are ready | lets the run begin |
 //! | the plant finishes | waits for the controller, then all is well |
+//! | the controller is killed, and may be restarted | starts another one, while the plant's watchdog holds the robot |
 //! | a process ends too early, or falls silent | says so, ends the other one: fault |
 //! | Ctrl-C, SIGTERM | ends both: interrupted |
 //!
@@ -17,7 +18,7 @@ use std::path::PathBuf;
 use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{JoinHandle, sleep};
-use std::time::Duration;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use delmpc_controller_process::clock::monotonic_ns;
 use delmpc_controller_process::presence::{Peer, Presence};
@@ -55,6 +56,10 @@ pub struct Supervision {
     pub steering: Option<PlantPipe>,
     /// A process that is silent for this long has failed, s.
     pub hang_s: f64,
+    /// How often a controller that was killed is started again, within the same run.
+    pub restarts: u32,
+    /// A process that is started later than the other one, and by how much, s.
+    pub late: Option<(Role, f64)>,
 }
 
 /// How the processes ended.
@@ -68,13 +73,22 @@ pub enum Course {
     Fault(String),
 }
 
-/// The numbers by which the operating system knows the processes.
+/// A run nobody else has.
+#[allow(clippy::disallowed_methods, reason = "two runs differ even if the clock jumps: by their supervisors")]
+pub fn fresh_run() -> RunId {
+    let time_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as u64);
+    RunId::from_seeds(time_ns, std::process::id())
+}
+
+/// The numbers by which the operating system knows the processes, and how far they are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ProcessIds {
     /// The plant.
     pub plant: u32,
     /// The controller.
     pub controller: u32,
+    /// Whether the run has begun.
+    pub running: bool,
 }
 
 /// What one process is to its supervisor.
@@ -108,7 +122,18 @@ impl Supervision {
         let messages = File::create(&self.messages).map_err(Failure::fault)?;
         let messages = Arc::new(Mutex::new(messages));
         let mut processes = Vec::new();
-        for role in [Role::Plant, Role::Controller] {
+        let mut roles = [Role::Plant, Role::Controller];
+        if self.late.is_some_and(|(role, _)| role == Role::Plant) {
+            roles.reverse();
+        }
+        for role in roles {
+            if let Some((_, late_s)) = self.late.filter(|(late, _)| *late == role) {
+                let until_ns = monotonic_ns() + (late_s * 1e9) as u64;
+                while monotonic_ns() < until_ns && !stop.is_set() {
+                    let _ = presence.beat();
+                    sleep(LOOK);
+                }
+            }
             match self.start(&node, role, &messages) {
                 Ok(process) => processes.push(process),
                 Err(failure) => {
@@ -117,9 +142,15 @@ impl Supervision {
                 }
             }
         }
-        let ids = ProcessIds { plant: processes[0].child.id(), controller: processes[1].child.id() };
+        processes.sort_by_key(|process| process.role as u32);
+        let ids = ProcessIds {
+            plant: processes[0].child.id(),
+            controller: processes[1].child.id(),
+            running: false,
+        };
         say(&messages, &format!("run: plant process {}, controller process {}", ids.plant, ids.controller));
-        let begin = monotonic_ns();
+        let mut begin = monotonic_ns();
+        let (mut running, mut restarts) = (false, self.restarts);
         let course = loop {
             if stop.is_set() {
                 break Ok(Course::Interrupted);
@@ -127,18 +158,28 @@ impl Supervision {
             if let Err(error) = presence.beat() {
                 break Err(Failure::fault(error));
             }
+            if running && restarts > 0 && is_killed(&mut processes[1]) {
+                restarts -= 1;
+                begin = monotonic_ns();
+                match self.start(&node, Role::Controller, &messages) {
+                    Ok(process) => processes[1] = process,
+                    Err(failure) => break Err(failure),
+                }
+                say(&messages, &format!("run: controller process {} takes over", processes[1].child.id()));
+            }
             match self.judge(&mut processes, begin) {
                 Ok(None) => {}
                 Ok(Some(course)) => break Ok(course),
                 Err(failure) => break Err(failure),
             }
             let ready = |process: &Watched| process.peer.state() == Some(ProcessState::Ready);
-            if processes.iter().all(ready)
-                && let Err(error) = presence.announce(ProcessState::Running)
-            {
-                break Err(Failure::fault(error));
+            if processes.iter().all(ready) {
+                running = true;
+                if let Err(error) = presence.announce(ProcessState::Running) {
+                    break Err(Failure::fault(error));
+                }
             }
-            look(ids);
+            look(ProcessIds { plant: ids.plant, controller: processes[1].child.id(), running });
             sleep(LOOK);
         };
         end_all(&mut processes, &mut presence);
@@ -212,6 +253,14 @@ impl Supervision {
         }
         Ok((finished == processes.len()).then_some(Course::Finished))
     }
+}
+
+/// Whether a process was ended by a signal.
+fn is_killed(process: &mut Watched) -> bool {
+    if process.ended.is_none() {
+        process.ended = process.child.try_wait().unwrap_or(None);
+    }
+    process.ended.is_some_and(|status| status.signal().is_some())
 }
 
 /// Asks every living process to end, and kills it if it does not.

@@ -190,3 +190,49 @@ fn in_real_time_both_processes_leave_figures() {
     assert!(summary["state_to_command_age_p50_s"].as_f64().unwrap() > 0.0, "{summary}");
     assert!(summary["plant_real_time_factor"].as_f64().unwrap() <= 1.001, "{summary}");
 }
+
+#[test]
+fn a_killed_controller_is_taken_over_within_its_run() {
+    let folder = Folder::new("take-over");
+    let fault = ["--set", "duration_s=2", "--set", "fault.target=controller", "--set", "fault.kind=kill"];
+    let scenario = main_scenario();
+    let out = folder.path().to_str().unwrap();
+    let ended =
+        Delmpc::start(&[&["timing", &scenario, "--faults", "--out", out], &fault[..]].concat()).wait();
+    assert_eq!(ended.status, Some(0), "{}", ended.errors);
+    let run = folder.path().join("fault-0");
+    let messages = fs::read_to_string(run.join("messages.txt")).unwrap();
+    assert!(messages.contains("takes over"), "{messages}");
+    let text = fs::read_to_string(folder.path().join("faults.json")).unwrap();
+    let trials: serde_json::Value = serde_json::from_str(&text).unwrap();
+    assert_eq!((&trials[0]["leftovers"], &trials[0]["non_finite_torques"]), (&0.into(), &0.into()), "{text}");
+    // The one that took over works, and is heard.
+    assert!(fs::read_to_string(run.join("summary.json")).unwrap().contains("\"cycles\""));
+}
+
+#[test]
+fn processes_with_different_joints_do_not_meet() {
+    let folder = Folder::new("other-joints");
+    let robots = concat!(env!("CARGO_MANIFEST_DIR"), "/configs/robots");
+    for file in ["atlas.urdf", "atlas.toml"] {
+        let text = fs::read_to_string(format!("{robots}/{file}")).unwrap();
+        assert!(text.contains("l_arm_ely"));
+        fs::write(folder.path().join(file), text.replace("l_arm_ely", "l_arm_elbow")).unwrap();
+    }
+    let run_id = format!("{:016x}", folder.number());
+    let urdf = format!("robot.urdf={}/atlas.urdf", folder.path().display());
+    let scenario = main_scenario();
+    let arguments = |role: &'static str| {
+        let own: [&str; 4] = [role, &scenario, "--run-id", &run_id];
+        [&own[..], &SHORT[..]].concat()
+    };
+    let plant = Delmpc::start(&arguments("plant"));
+    wait_for("the plant's channels", || (shared_memory_of(&run_id).len() > 6).then_some(()));
+    let controller = Delmpc::start(&[&arguments("controller")[..], &["--set", &urdf]].concat());
+    let ended = controller.wait();
+    assert_eq!(ended.status, Some(3), "{}", ended.errors);
+    assert!(ended.errors.contains("the peer has joint set"), "{}", ended.errors);
+    support::signal(plant.pid(), Signal::TERM);
+    assert_eq!(plant.wait().status, Some(130));
+    assert_eq!(shared_memory_of(&run_id), Vec::<String>::new());
+}

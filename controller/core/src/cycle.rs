@@ -57,6 +57,8 @@ pub mod reason {
     pub const OUT_OF_ORDER: u32 = 101;
     /// The estimator refused it.
     pub const ESTIMATOR: u32 = 102;
+    /// The measurement is from a time that has not come: believed, it would make all true ones look old.
+    pub const AHEAD: u32 = 103;
     /// The prediction to the time of the command failed.
     pub const PREDICTION: u32 = 110;
     /// A stage of the horizon could not be simulated.
@@ -315,6 +317,9 @@ impl Controller {
         state.validate(self.model.joint_set_hash, n).map_err(|error| error.code())?;
         if now_ns.saturating_sub(state.time_ns) as f64 * 1e-9 > self.config.max_state_age_s {
             return Err(reason::STALE);
+        }
+        if state.time_ns > now_ns {
+            return Err(reason::AHEAD);
         }
         if self.last_state_ns.is_some_and(|last| state.time_ns < last) {
             return Err(reason::OUT_OF_ORDER);

@@ -45,6 +45,9 @@ fn bad_states_are_refused_by_name_and_the_ladder_is_climbed_back() {
     assert_eq!(cycle(&|_| {}, 35, 0), fresh);
     // A state from the past, though not too old.
     assert_eq!(cycle(&|s| s.time_ns -= 2 * PERIOD_NS, 36, 0).1, reason::OUT_OF_ORDER);
+    // One from the future, which must not make the true ones after it look old.
+    assert_eq!(cycle(&|s| s.time_ns += 1_000_000_000, 37, 0).1, reason::AHEAD);
+    assert_eq!(cycle(&|_| {}, 38, 0).1, 0);
 }
 
 #[test]

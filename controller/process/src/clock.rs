@@ -30,7 +30,7 @@ pub struct Ticker {
 }
 
 /// How a tick came.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Tick {
     /// When it was due.
     pub due_ns: u64,

@@ -15,9 +15,11 @@ use delmpc_messages::{Command, PlantState, ProcessState, status};
 use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::{LinkError, Publisher, Subscriber};
 
-use crate::clock::{Ticker, monotonic_ns};
+use crate::clock::{Tick, Ticker, monotonic_ns};
 use crate::figures::{CycleFigure, CycleFigures};
 use crate::membership::{Attendance, Order};
+use crate::records::{CycleRecord, Records};
+use crate::usage::Usage;
 
 /// What computes a command from a state.
 pub trait Controller {
@@ -43,7 +45,7 @@ pub enum Ending {
 const PAUSE: Duration = Duration::from_micros(50);
 
 /// Cycles before the first answer in real time.
-const WARM_UP_CYCLES: u32 = 10;
+pub const WARM_UP_CYCLES: u32 = 10;
 
 /// The loop and its ends of the links.
 #[derive(Debug)]
@@ -59,6 +61,8 @@ pub struct ControllerLoop<'a, S, P> {
     /// Counts the heap allocations of this process so far.
     allocations: Option<fn() -> u64>,
     figures: CycleFigures,
+    /// Every cycle with its times, when somebody wants them.
+    records: Records<CycleRecord>,
 }
 
 impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S, P> {
@@ -75,7 +79,15 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
             delay_ns: (scenario.sensors.delay_s * 1e9).round() as u64,
             allocations: None,
             figures: CycleFigures::with_capacity(cycles as usize + 1000),
+            records: Records::none(),
         }
+    }
+
+    /// Keeps a record of every cycle.
+    #[must_use]
+    pub fn recording(mut self) -> Self {
+        self.records = Records::with_capacity(self.figures.capacity());
+        self
     }
 
     /// Counts the heap allocations of every cycle, by a function that counts those of the process so far.
@@ -93,13 +105,13 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
         mut self,
         controller: &mut impl Controller,
         membership: &mut impl Attendance,
-    ) -> Result<(Ending, CycleFigures), LinkError> {
+    ) -> Result<(Ending, CycleFigures, Records<CycleRecord>), LinkError> {
         let ending = match self.scenario.clock {
             Clock::Realtime => self.run_by_the_clock(controller, membership)?,
             Clock::Lockstep => self.run_state_by_state(controller, membership)?,
         };
         membership.announce(ProcessState::Finished)?;
-        Ok((ending, self.figures))
+        Ok((ending, self.figures, self.records))
     }
 
     fn run_by_the_clock(
@@ -120,7 +132,11 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
             if self.plant_is_done() {
                 return Ok(Ending::Finished);
             }
-            running |= self.state.header.sequence > 1;
+            if !running && self.state.header.sequence > 1 {
+                running = true;
+                // Without a first answer of ours: the run is under way, and we take over from one that is gone.
+                membership.announce(ProcessState::Ready)?;
+            }
             if !news && !running {
                 self.commands.serve_newcomers()?;
                 continue;
@@ -128,7 +144,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
             if !running {
                 self.warm_up(controller);
             }
-            let sent_ns = self.cycle(controller, tick.due_ns)?;
+            let sent_ns = self.cycle(controller, tick)?;
             if running {
                 let missed = u64::from(sent_ns > tick.due_ns + period_ns);
                 self.figures.deadline_misses += missed + tick.missed;
@@ -156,7 +172,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
             if self.plant_is_done() {
                 return Ok(Ending::Finished);
             }
-            self.cycle(controller, 0)?;
+            self.cycle(controller, Tick::default())?;
             if self.state.header.sequence == 1 {
                 membership.announce(ProcessState::Ready)?;
             }
@@ -169,7 +185,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
     /// When a link breaks.
     pub fn answer(&mut self, controller: &mut impl Controller) -> Result<(), LinkError> {
         if self.receive()? && !self.plant_is_done() {
-            self.cycle(controller, 0)?;
+            self.cycle(controller, Tick::default())?;
         }
         Ok(())
     }
@@ -197,6 +213,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
     fn first_answer_given(&mut self, membership: &mut impl Attendance) -> Result<(), LinkError> {
         // What the first cycles cost is not what a cycle costs.
         self.figures = CycleFigures::with_capacity(self.figures.capacity());
+        self.records.clear();
         membership.announce(ProcessState::Ready)
     }
 
@@ -209,8 +226,9 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
     }
 
     /// One cycle; returns when its command was sent. In lockstep nothing that depends on a clock enters the command.
-    fn cycle(&mut self, controller: &mut impl Controller, due_ns: u64) -> Result<u64, LinkError> {
+    fn cycle(&mut self, controller: &mut impl Controller, tick: Tick) -> Result<u64, LinkError> {
         let realtime = self.scenario.clock == Clock::Realtime;
+        let usage = self.records.are_kept().then(Usage::now);
         let begin_ns = monotonic_ns();
         let measured_ns = self.state.header.sent_at_ns;
         // The plant's clock runs with ours; a state says what it showed when it was measured, and is sent `delay_s` later. It
@@ -234,7 +252,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
         }
         self.commands.send(command)?;
         let sent_ns = monotonic_ns();
-        let feedback_ns = computed_ns - if realtime { due_ns.min(begin_ns) } else { begin_ns };
+        let feedback_ns = computed_ns - if realtime { tick.due_ns.min(begin_ns) } else { begin_ns };
         let figure = CycleFigure {
             total_ns: feedback_ns + ahead_ns,
             feedback_ns,
@@ -246,13 +264,24 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
         self.figures.add(command, figure);
         command.report.publish_ns = if realtime { sent_ns - computed_ns } else { 0 };
         controller.prepare();
+        if let Some(before) = usage {
+            let woke_ns = tick.due_ns + tick.late_ns;
+            let times = [tick.due_ns, woke_ns, begin_ns, computed_ns, sent_ns, monotonic_ns()];
+            let used = Usage::now().since(&before);
+            let mut record = CycleRecord::new(times, tick.missed, &self.state, command, &used);
+            if ahead_ns > 0 {
+                self.records.credit_preparation(&command.report);
+                (record.shift_ns, record.linearize_ns, record.riccati_ns) = (0, 0, 0);
+            }
+            self.records.keep(record);
+        }
         Ok(sent_ns)
     }
 }
 
-/// Says which state a command answers, and numbers it.
+/// Says which state a command answers, and numbers it: higher than all before, those of a controller that is gone included.
 pub fn address(command: &mut Command, state: &PlantState) {
-    command.header.sequence += 1;
+    command.header.sequence = command.header.sequence.max(state.applied_command_sequence) + 1;
     command.state_sequence = state.header.sequence;
     if state.header.sequence <= 1 {
         // The plant that waits for its first answer has had commands before, as far as the robot is concerned.

@@ -9,6 +9,8 @@
 //! | [`membership`] | the three together: a process's part in a run |
 //! | [`controller_loop`] | receive, cycle, send, by the wall clock or state by state |
 //! | [`figures`] | what the cycles cost |
+//! | [`records`] | every cycle and every plant step with its times, for the timing report |
+//! | [`usage`] | page faults, context switches and CPU time of the calling thread |
 
 pub mod clock;
 pub mod controller_loop;
@@ -16,4 +18,6 @@ pub mod figures;
 pub mod machine;
 pub mod membership;
 pub mod presence;
+pub mod records;
 pub mod stop;
+pub mod usage;

@@ -6,7 +6,7 @@ use rustix::process::{Resource, geteuid, getrlimit};
 use rustix::thread::{CpuSet, sched_setaffinity};
 use thread_priority::{
     RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue, ThreadSchedulePolicy,
-    set_thread_priority_and_policy, thread_native_id,
+    set_thread_priority_and_policy, thread_native_id, thread_schedule_policy,
 };
 
 /// Binds the calling thread to a core, raises it to SCHED_FIFO and keeps all memory in RAM, as far as asked and permitted. Returns a
@@ -38,6 +38,11 @@ pub fn prepare(settings: &ProcessSettings, core: Option<usize>) -> Vec<String> {
         warnings.push(message.to_owned());
     }
     warnings
+}
+
+/// Whether the calling thread has a real-time priority.
+pub fn is_realtime() -> bool {
+    matches!(thread_schedule_policy(), Ok(ThreadSchedulePolicy::Realtime(_)))
 }
 
 fn raise_priority(priority: u8) -> bool {

@@ -6,11 +6,15 @@ use std::path::Path;
 use toml::de::{DeTable, DeValue};
 use toml::{Spanned, Table, Value};
 
+use crate::fault::FAULT_KINDS;
 use crate::range::check;
 use crate::{Place, Scenario, ScenarioError};
 
 /// Larger files are no scenarios.
 const LARGEST_FILE: u64 = 1 << 20;
+
+/// Keys that hold one table or a list of tables.
+const LISTS: [&str; 2] = ["push", "fault"];
 
 /// A scenario file, with overrides, and where each key came from.
 #[derive(Debug, Clone)]
@@ -67,7 +71,8 @@ impl Document {
         Ok(document)
     }
 
-    /// Overrides a key: `key=value`, with the value as in TOML; strings may go without quotes. `push.…` means the first push.
+    /// Overrides a key: `key=value`, with the value as in TOML; strings may go without quotes. `push.…` means the first push,
+    /// `fault.…` the first fault.
     ///
     /// # Errors
     /// [`ScenarioError::MalformedOverride`], [`ScenarioError::UnknownKey`], [`ScenarioError::WrongType`].
@@ -90,8 +95,10 @@ impl Document {
             wrapped = Value::Table(Table::from_iter([(part.to_owned(), wrapped)]));
         }
         let place = Place::Override(text.to_owned());
-        if let Some(name) = key.strip_prefix("push.") {
-            self.places.insert(format!("push[0].{name}"), place.clone());
+        for list in LISTS {
+            if let Some(name) = key.strip_prefix(list).and_then(|rest| rest.strip_prefix('.')) {
+                self.places.insert(format!("{list}[0].{name}"), place.clone());
+            }
         }
         self.places.insert(key.to_owned(), place);
         let wrapped = self.typed("", wrapped, &self.catalogue)?;
@@ -151,7 +158,7 @@ impl Document {
                 }
                 Ok(Value::Table(typed))
             }
-            (Value::Array(list), Value::Table(_)) if key == "push" => {
+            (Value::Array(list), Value::Table(_)) if LISTS.contains(&key) => {
                 let each = |(index, value)| self.typed(&format!("{key}[{index}]"), value, pattern);
                 Ok(Value::Array(list.into_iter().enumerate().map(each).collect::<Result<_, _>>()?))
             }
@@ -251,7 +258,12 @@ fn merge(table: &mut Table, changes: Table) {
 
 /// The allowed words of a key that takes one of a few.
 fn words(key: &str) -> Option<&'static [&'static str]> {
-    match key {
+    // In a list too: `fault[3].kind`.
+    let of_list =
+        key.split_once('[').zip(key.split_once("].")).map(|((list, _), (_, name))| join(list, name));
+    match of_list.as_deref().unwrap_or(key) {
+        "fault.kind" => Some(&FAULT_KINDS),
+        "fault.target" => Some(&["state", "command", "plant", "controller", "machine"]),
         "clock" => Some(&["realtime", "lockstep"]),
         "controller.kind" => Some(&["mpc", "static-lqr", "off"]),
         _ => None,

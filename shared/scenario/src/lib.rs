@@ -19,7 +19,7 @@
 //! - `key=value` overrides are typed like the key they replace ([`Document::set`]).
 //! - [`Scenario::to_toml`] writes the *effective* configuration: every key, in the same format, readable again.
 //!
-//! Reading order: `scenario` (the keys), `range` (their rules), `document` (text to scenario), `error`.
+//! Reading order: `scenario` and `fault` (the keys), `range` (their rules), `document` (text to scenario), `error`.
 #![allow(
     clippy::result_large_err,
     reason = "an error here ends the reading of a file; its size costs nothing"
@@ -27,13 +27,16 @@
 
 mod document;
 mod error;
+mod fault;
 mod list;
 mod range;
 mod scenario;
 
 pub use document::Document;
 pub use error::{Place, ScenarioError};
+pub use fault::{FaultKind, FaultSettings, FaultTarget};
 pub use scenario::{
     Clock, ConstraintSettings, ControllerKind, ControllerSettings, PlantSettings, ProcessSettings,
-    PushSettings, ReachSettings, RobotSettings, Scenario, SensorSettings, SuccessSettings, WeightSettings,
+    PushSettings, ReachSettings, RobotSettings, Scenario, SensorSettings, SuccessSettings, TimingSettings,
+    WeightSettings,
 };

@@ -2,25 +2,25 @@
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-use crate::PushSettings;
-
 #[derive(Deserialize)]
 #[serde(untagged)]
-enum OneOrMany {
-    Many(Vec<PushSettings>),
-    One(PushSettings),
+enum OneOrMany<T> {
+    Many(Vec<T>),
+    One(T),
 }
 
 /// Reads `[push]` as a list of one.
-pub(crate) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<PushSettings>, D::Error> {
+pub(crate) fn deserialize<'de, T: Deserialize<'de>, D: Deserializer<'de>>(
+    from: D,
+) -> Result<Vec<T>, D::Error> {
     Ok(match OneOrMany::deserialize(from)? {
         OneOrMany::Many(list) => list,
-        OneOrMany::One(push) => vec![push],
+        OneOrMany::One(one) => vec![one],
     })
 }
 
 /// Writes a list of one as `[push]`.
-pub(crate) fn serialize<S: Serializer>(list: &[PushSettings], to: S) -> Result<S::Ok, S::Error> {
+pub(crate) fn serialize<T: Serialize, S: Serializer>(list: &[T], to: S) -> Result<S::Ok, S::Error> {
     match list {
         [one] => one.serialize(to),
         many => many.serialize(to),

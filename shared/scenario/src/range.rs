@@ -1,6 +1,6 @@
 //! The rules values must keep. Each names the key, the value, the rule and a remedy.
 
-use crate::{ControllerSettings, Scenario};
+use crate::{ControllerSettings, FaultKind, FaultSettings, FaultTarget, Scenario, TimingSettings};
 
 /// A broken rule.
 #[derive(Debug, Clone, PartialEq)]
@@ -101,6 +101,10 @@ pub(crate) fn check(scenario: &Scenario) -> Result<(), Violation> {
         within(&key("duration_s"), push.duration_s, plant.step_s, 3600.0)?;
     }
 
+    for (index, fault) in scenario.fault.iter().enumerate() {
+        check_fault(fault, index, scenario.fault.len())?;
+    }
+
     for (key, value) in [
         ("success.hand_error_at_deadline_m", success.hand_error_at_deadline_m),
         ("success.hand_error_hold_max_m", success.hand_error_hold_max_m),
@@ -112,7 +116,49 @@ pub(crate) fn check(scenario: &Scenario) -> Result<(), Violation> {
     ] {
         within(key, value, 0.0, f64::MAX)?;
     }
-    within("success.min_cop_margin_m", success.min_cop_margin_m, -10.0, 10.0)
+    within("success.min_cop_margin_m", success.min_cop_margin_m, -10.0, 10.0)?;
+    check_timing(&scenario.timing)
+}
+
+fn check_fault(fault: &FaultSettings, index: usize, faults: usize) -> Result<(), Violation> {
+    use FaultTarget::{Command, Controller, Machine, Plant, State};
+    let key = |name: &str| match faults {
+        1 => format!("fault.{name}"),
+        _ => format!("fault[{index}].{name}"),
+    };
+    let targets: &[FaultTarget] = match fault.kind {
+        kind if kind.is_of_messages() => &[State, Command],
+        FaultKind::KillRun | FaultKind::ClockJump => &[Machine],
+        _ => &[Plant, Controller],
+    };
+    if !targets.contains(&fault.target) {
+        let words: Vec<&str> = targets.iter().map(|target| target.word()).collect();
+        let rule = format!("a fault of kind \"{}\" does not happen to it", fault.kind.word());
+        let remedy = format!("take {}", words.join(" or "));
+        return Err(violation(&key("target"), format!("\"{}\"", fault.target.word()), &rule, &remedy));
+    }
+    within(&key("start_s"), fault.start_s, 0.0, 3600.0)?;
+    within(&key("count"), f64::from(fault.count), 1.0, 1e6)?;
+    within(&key("probability"), fault.probability, 0.0, 1.0)?;
+    // The times of a message are shifted by a whole number of nanoseconds, 32 bits of them.
+    within(&key("size_s"), fault.size_s, 0.0, if fault.kind.is_of_messages() { 4.0 } else { 60.0 })
+}
+
+fn check_timing(timing: &TimingSettings) -> Result<(), Violation> {
+    within("timing.event_s", timing.event_s, 1e-6, 1.0)?;
+    within("timing.compute_budget", timing.compute_budget, 0.01, 1.0)?;
+    within("timing.compute_spread", timing.compute_spread, 1.0, 1e3)?;
+    for (key, value) in [
+        ("timing.misses_of_floor", Some(timing.misses_of_floor)),
+        ("timing.wake_up_of_floor", Some(timing.wake_up_of_floor)),
+        ("timing.round_trip_of_floor", Some(timing.round_trip_of_floor)),
+        ("timing.max_wake_up_p99_s", timing.max_wake_up_p99_s),
+        ("timing.max_cycle_p999_s", timing.max_cycle_p999_s),
+        ("timing.max_age_p99_s", timing.max_age_p99_s),
+    ] {
+        within(key, value.unwrap_or(0.0), 0.0, f64::MAX)?;
+    }
+    Ok(())
 }
 
 fn check_controller(controller: &ControllerSettings) -> Result<(), Violation> {

@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::FaultSettings;
+
 /// Everything that decides a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -30,8 +32,13 @@ pub struct Scenario {
     /// Pushes: one table `[push]` or a list `[[push]]`.
     #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
     pub push: Vec<PushSettings>,
+    /// Faults on purpose: one table `[fault]` or a list `[[fault]]`.
+    #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
+    pub fault: Vec<FaultSettings>,
     /// What counts as success.
     pub success: SuccessSettings,
+    /// What counts as timing kept: `delmpc timing`.
+    pub timing: TimingSettings,
 }
 
 /// Which clock a run follows.
@@ -192,7 +199,8 @@ pub struct ConstraintSettings {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ProcessSettings {
-    /// Real-time priority (SCHED_FIFO) of both processes, 1 to 99; 0: ordinary priority.
+    /// Real-time priority (SCHED_FIFO) of the controller, 1 to 99; the plant, whose period is shorter, has one more. 0: ordinary
+    /// priority for both.
     pub priority: u8,
     /// Whether all memory is kept in RAM.
     pub lock_memory: bool,
@@ -266,6 +274,54 @@ pub struct SuccessSettings {
     pub min_real_time_factor: f64,
 }
 
+/// Thresholds of `delmpc timing`. Those named `…_of_floor` are relative to what the machine itself does in the same minutes; absolute ones
+/// hold when given.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TimingSettings {
+    /// Time without the core from which on the machine is said to have interfered, s.
+    pub event_s: f64,
+    /// Time a cycle may compute, as part of its period: a deadline missed by a cycle that computed longer is the software's.
+    pub compute_budget: f64,
+    /// Longest 99.9 % of the cycles' computing time over its median, where the machine did not interfere.
+    pub compute_spread: f64,
+    /// Largest share of missed deadlines, relative to that of a loop that only burns the same time.
+    pub misses_of_floor: f64,
+    /// Largest 99 % of the wake-up latency, relative to an idle thread's.
+    pub wake_up_of_floor: f64,
+    /// Largest median of the round trip between the processes, relative to that of a flag in shared memory.
+    pub round_trip_of_floor: f64,
+    /// Most deadlines that may be missed, whoever is to blame.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_misses: Option<u32>,
+    /// Largest 99 % of the controller's wake-up latency, s.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_wake_up_p99_s: Option<f64>,
+    /// Largest 99.9 % of the cycle time, s.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_cycle_p999_s: Option<f64>,
+    /// Largest 99 % of the time from a measurement to the arrival of its command, s.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_age_p99_s: Option<f64>,
+}
+
+impl Default for TimingSettings {
+    fn default() -> Self {
+        Self {
+            event_s: 1e-4,
+            compute_budget: 1.0,
+            compute_spread: 1.5,
+            misses_of_floor: 2.0,
+            wake_up_of_floor: 4.0,
+            round_trip_of_floor: 4.0,
+            max_misses: None,
+            max_wake_up_p99_s: None,
+            max_cycle_p999_s: None,
+            max_age_p99_s: None,
+        }
+    }
+}
+
 impl Default for Scenario {
     fn default() -> Self {
         Self {
@@ -280,7 +336,9 @@ impl Default for Scenario {
             process: ProcessSettings::default(),
             reach: None,
             push: Vec::new(),
+            fault: Vec::new(),
             success: SuccessSettings::default(),
+            timing: TimingSettings::default(),
         }
     }
 }
@@ -421,6 +479,14 @@ impl Scenario {
             },
             reach: Some(ReachSettings::default()),
             push: vec![PushSettings::default()],
+            fault: vec![FaultSettings::default()],
+            timing: TimingSettings {
+                max_misses: Some(0),
+                max_wake_up_p99_s: Some(0.0),
+                max_cycle_p999_s: Some(0.0),
+                max_age_p99_s: Some(0.0),
+                ..TimingSettings::default()
+            },
             ..Self::default()
         }
     }

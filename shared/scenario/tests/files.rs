@@ -263,3 +263,36 @@ fn files_that_are_none_are_refused() {
     assert!(refused("/dev/zero").contains("not a regular file"));
     assert!(refused(env!("CARGO_MANIFEST_DIR")).contains("not a regular file"));
 }
+
+#[test]
+fn faults_are_a_list_whose_words_and_targets_are_checked() {
+    let list = |text: &str| format!("{SMALL}\n[[fault]]\n{text}\n[[fault]]\nkind = \"lost\"\ncount = 3\n");
+    let two = list("kind = \"stop\"\ntarget = \"plant\"\nsize_s = 0.05");
+    let scenario = Document::parse("faults.toml", &two).unwrap().scenario().unwrap();
+    assert_eq!((scenario.fault.len(), scenario.fault[1].count), (2, 3));
+    let again = Document::parse("effective", &scenario.to_toml()).unwrap().scenario().unwrap();
+    assert_eq!(again, scenario);
+    for (text, expected) in [
+        ("kind = \"explode\"", "\"lost\" or"),
+        ("knd = \"lost\"", "did you mean `fault[0].kind`"),
+        ("kind = \"stop\"", "does not happen to it"),
+        ("probability = 2.0", "fault[0].probability"),
+    ] {
+        let message = refused(&list(text));
+        assert!(message.contains(expected), "{text}: {message}");
+    }
+    let mut document = small();
+    document.set("fault.kind=not-a-number").unwrap();
+    document.set("fault.target=state").unwrap();
+    assert_eq!(document.scenario().unwrap().fault[0].kind.word(), "not-a-number");
+    assert!(document.set("fault.kind=explode").is_err());
+}
+
+#[test]
+fn thresholds_of_timing_have_ranges() {
+    assert!(refused_with("timing.compute_budget=1.5").contains("timing.compute_budget"));
+    assert!(refused_with("timing.event_s=0").contains("timing.event_s"));
+    let mut document = small();
+    document.set("timing.max_misses=0").unwrap();
+    assert_eq!(document.scenario().unwrap().timing.max_misses, Some(0));
+}

@@ -21,7 +21,7 @@ pub struct Schedule {
 enum Rule {
     InARow { first: u64, length: u64 },
     Every { period: u64, length: u64 },
-    Random { probability: f64, random: SplitMix64 },
+    Random { first: u64, length: u64, probability: f64, random: SplitMix64 },
 }
 
 impl Schedule {
@@ -47,7 +47,12 @@ impl Schedule {
 
     /// Each message with this probability, independently of the others.
     pub fn random(probability: f64, seed: u64) -> Self {
-        Self { rule: Rule::Random { probability, random: SplitMix64::new(seed) }, count: 0 }
+        Self::random_among(0, u64::MAX, probability, seed)
+    }
+
+    /// Each of `length` messages, beginning with message `first`, with this probability.
+    pub fn random_among(first: u64, length: u64, probability: f64, seed: u64) -> Self {
+        Self { rule: Rule::Random { first, length, probability, random: SplitMix64::new(seed) }, count: 0 }
     }
 
     /// Counts the next message and says whether it is struck.
@@ -55,11 +60,17 @@ impl Schedule {
         let message = self.count;
         self.count = message.wrapping_add(1);
         match &mut self.rule {
-            Rule::InARow { first, length } => message >= *first && message - *first < *length,
+            Rule::InARow { first, length } => among(message, *first, *length),
             Rule::Every { period, length } => message % *period >= period.saturating_sub(*length),
-            Rule::Random { probability, random } => random.uniform() < *probability,
+            Rule::Random { first, length, probability, random } => {
+                among(message, *first, *length) && random.uniform() < *probability
+            }
         }
     }
+}
+
+fn among(message: u64, first: u64, length: u64) -> bool {
+    message >= first && message - first < length
 }
 
 #[cfg(test)]
@@ -89,5 +100,6 @@ mod tests {
         assert!((850..1_150).contains(&hits.len()), "{} of 10000", hits.len());
         assert_eq!(struck(Schedule::random(0.0, 1), 100), []);
         assert_eq!(struck(Schedule::random(1.0, 1), 100).len(), 100);
+        assert_eq!(struck(Schedule::random_among(3, 4, 1.0, 1), 100), [3, 4, 5, 6]);
     }
 }

@@ -1,5 +1,6 @@
 //! The two ends of a channel in shared memory.
 
+use iceoryx2::identifiers::UniquePublisherId;
 use iceoryx2::port::publisher::Publisher as PublisherPort;
 use iceoryx2::port::subscriber::Subscriber as SubscriberPort;
 use iceoryx2::port::update_connections::UpdateConnections;
@@ -22,10 +23,13 @@ pub struct SharedSubscriber<T: Payload> {
     /// The message given out. Declared before `port`, so that it is given back first.
     held: Option<Sample<ipc::Service, T, ()>>,
     port: SubscriberPort<ipc::Service, T, ()>,
+    /// Who sent the message given out last.
+    origin: Option<UniquePublisherId>,
     channel: &'static str,
 }
 
-/// Messages looked at per call. One is normal; a second one is that of a publisher that died, or came in during the call.
+/// Messages looked at per call. One is normal, and a publisher has no more than one waiting. Only when it is from another publisher than
+/// the last one may there be two, for one that was started anew: looking again costs as much as the message itself.
 const MOST_WAITING: usize = 4;
 
 impl<T: Payload> SharedPublisher<T> {
@@ -40,7 +44,7 @@ impl<T: Payload> SharedPublisher<T> {
 
 impl<T: Payload> SharedSubscriber<T> {
     pub(crate) fn new(port: SubscriberPort<ipc::Service, T, ()>, channel: &'static str) -> Self {
-        Self { held: None, port, channel }
+        Self { held: None, port, origin: None, channel }
     }
 }
 
@@ -61,7 +65,15 @@ impl<T: Payload> Subscriber<T> for SharedSubscriber<T> {
         for _ in 0..MOST_WAITING {
             let received = self.port.receive();
             match received.map_err(|source| LinkError::Receive { channel: self.channel, source })? {
-                Some(sample) => self.held = Some(sample),
+                Some(sample) => {
+                    let origin = Some(sample.header().publisher_id());
+                    let same = self.origin == origin;
+                    self.origin = origin;
+                    self.held = Some(sample);
+                    if same {
+                        break;
+                    }
+                }
                 None => break,
             }
         }

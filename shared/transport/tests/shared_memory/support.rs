@@ -18,6 +18,7 @@ const WATCHDOG: Duration = Duration::from_secs(60);
 pub struct TestRun(pub RunId);
 
 impl TestRun {
+    #[allow(clippy::disallowed_methods, reason = "only to tell runs apart")]
     pub fn new() -> Self {
         static COUNT: AtomicU64 = AtomicU64::new(0);
         let time = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_nanos() as u64;

@@ -182,6 +182,7 @@ fn leftovers_of_killed_processes_are_removed() {
 }
 
 #[test]
+#[allow(clippy::disallowed_methods, reason = "ages of files go by the wall clock")]
 fn dead_runs_are_removed_and_living_or_young_ones_are_not() {
     let (dead, living, young) = (TestRun::new(), TestRun::new(), TestRun::new());
     for run in [&dead, &young] {
