@@ -19,8 +19,10 @@
 #![allow(clippy::needless_range_loop)]
 
 mod articulated_body;
+mod automatic;
 mod exact_newton;
 mod figure1;
+mod figure2;
 mod one_step;
 mod pendulum;
 mod plot;
@@ -104,7 +106,8 @@ impl Campaign {
 type Runner = fn(&Campaign) -> Result<Part, Failure>;
 
 /// Parts with their share of the bar.
-const PARTS: [(&str, usize, Runner); 1] = [("figure1", figure1::CELLS, figure1::run)];
+const PARTS: [(&str, usize, Runner); 2] =
+    [("figure1", figure1::CELLS, figure1::run), ("figure2", figure2::CELLS, figure2::run)];
 
 fn campaign(arguments: &Arguments) -> Result<Vec<Claim>, Failure> {
     let out = &arguments.out;

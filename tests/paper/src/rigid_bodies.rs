@@ -37,17 +37,21 @@ pub struct Link {
     /// `usize::MAX` at the root.
     pub parent: usize,
     /// Rotation of the joint: `E0 + cos q E1 + sin q E2`, row by row.
-    e0: [f64; 9],
-    e1: [f64; 9],
-    e2: [f64; 9],
+    pub e0: [f64; 9],
+    /// Times `cos q`.
+    pub e1: [f64; 9],
+    /// Times `sin q`.
+    pub e2: [f64; 9],
     /// Joint origin in the parent's link axes, m.
-    origin: [f64; 3],
-    axis: [f64; 3],
-    com: [f64; 3],
+    pub origin: [f64; 3],
+    /// In link axes.
+    pub axis: [f64; 3],
+    /// Mass centre in link axes, m.
+    pub com: [f64; 3],
     /// kg.
     pub mass: f64,
     /// About the mass centre in link axes: xx, yy, zz, xy, xz, yz.
-    inertia: [f64; 6],
+    pub inertia: [f64; 6],
 }
 
 /// Poses and joint twists.
