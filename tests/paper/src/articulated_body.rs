@@ -195,15 +195,15 @@ impl ArticulatedBody {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::pendulum::{Links, initial_conditions, pendulum};
     use delmpc_mechanics::inverse_dynamics::{InverseDynamicsWorkspace, inverse_dynamics_into};
     use delmpc_mechanics::kinematics::{Configuration, Kinematics, Velocity};
     use delmpc_mechanics::prelude::*;
 
-    /// A tree with two branches, skew axes and turned placements.
-    fn tree() -> KinematicTree {
+    /// A tree with three branches, skew axes and turned placements.
+    pub fn tree() -> KinematicTree {
         let mut builder = TreeBuilder::fixed_base(Vector3::new(0.3, -0.2, -9.81));
         let inertia = Matrix3::new(0.3, 0.02, -0.01, 0.02, 0.25, 0.03, -0.01, 0.03, 0.2);
         let parents = [None, Some(0), Some(1), Some(1), Some(3), Some(0)];

@@ -23,12 +23,16 @@ mod automatic;
 mod exact_newton;
 mod figure1;
 mod figure2;
+mod hermite_simpson;
+mod inverse_dynamics_derivatives;
 mod one_step;
 mod pendulum;
+mod pivoted_lu;
 mod plot;
 mod quasi_newton;
 mod results;
 mod rigid_bodies;
+mod runge_kutta;
 mod stopwatch;
 
 use std::path::{Path, PathBuf};
