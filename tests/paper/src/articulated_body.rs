@@ -18,8 +18,8 @@
 use delmpc_mechanics::prelude::KinematicTree;
 
 use crate::rigid_bodies::{
-    Inertia, M6, Pose, RigidBodies, RivalError, V6, add6, axpy6, bracket, cross, cross_wrench, dot6,
-    symmetric_times,
+    Inertia, M6, Pose, RigidBodies, RivalError, V6, add6, array, axpy6, bracket, cross, cross_wrench, dot6,
+    symmetric_times, vectorized,
 };
 
 /// Workspace for one tree.
@@ -70,51 +70,52 @@ impl ArticulatedBody {
 
     /// `q̈` without joint torques. O(n), no allocation.
     pub fn acceleration_into(&mut self, q: &[f64], v: &[f64], out: &mut [f64]) {
-        self.arch.dispatch(
-            #[inline(always)]
-            || self.accelerate(q, v, out),
-        );
+        vectorized!(self.arch, (), (
+            work: &'a mut ArticulatedBody = self, q: &'a [f64] = q, v: &'a [f64] = v, out: &'a mut [f64] = out
+        ) => work.accelerate(q, v, out));
     }
 
     /// Articulated inertias at `q` for [`Self::solve`]. O(n), no allocation.
     pub fn factor(&mut self, q: &[f64]) {
-        self.arch.dispatch(
-            #[inline(always)]
-            || {
-                for i in 0..self.dof() {
-                    self.place(i, q[i]);
-                    self.inertias[i] = self.bodies.inertia(i, &self.poses[i]).matrix();
-                }
-                for i in (0..self.dof()).rev() {
-                    self.reduce(i);
-                }
-            },
-        );
+        vectorized!(self.arch, (), (work: &'a mut ArticulatedBody = self, q: &'a [f64] = q) => work.reduce_all(q));
     }
 
     /// `x := M⁻¹ x` at the configuration last factored: the impulse response of the articulated bodies. O(n), no allocation.
     pub fn solve(&mut self, x: &mut [f64]) {
-        self.arch.dispatch(
-            #[inline(always)]
-            || {
-                self.biases.fill([0.0; 6]);
-                for i in (0..self.dof()).rev() {
-                    let bias = self.biases[i];
-                    x[i] = (x[i] - dot6(&self.poses[i].twist, &bias)) * self.inverse[i];
-                    let parent = self.bodies.links[i].parent;
-                    if parent != usize::MAX {
-                        let handed = axpy6(&bias, x[i], &self.columns[i]);
-                        self.biases[parent] = add6(&self.biases[parent], &handed);
-                    }
-                }
-                for i in 0..self.dof() {
-                    let parent = self.bodies.links[i].parent;
-                    let ahead = if parent == usize::MAX { [0.0; 6] } else { self.accelerations[parent] };
-                    x[i] -= dot6(&self.columns[i], &ahead) * self.inverse[i];
-                    self.accelerations[i] = axpy6(&ahead, x[i], &self.poses[i].twist);
-                }
-            },
-        );
+        vectorized!(self.arch, (), (work: &'a mut ArticulatedBody = self, x: &'a mut [f64] = x) => work.respond(x));
+    }
+
+    #[inline(always)]
+    fn reduce_all(&mut self, q: &[f64]) {
+        for i in 0..self.dof() {
+            self.place(i, q[i]);
+            self.inertias[i] = self.bodies.inertia(i, &self.poses[i]).matrix();
+        }
+        for i in (0..self.dof()).rev() {
+            self.reduce(i);
+        }
+    }
+
+    #[inline(always)]
+    fn respond(&mut self, x: &mut [f64]) {
+        for bias in &mut self.biases {
+            *bias = [0.0; 6];
+        }
+        for i in (0..self.dof()).rev() {
+            let bias = self.biases[i];
+            x[i] = (x[i] - dot6(&self.poses[i].twist, &bias)) * self.inverse[i];
+            let parent = self.bodies.links[i].parent;
+            if parent != usize::MAX {
+                let handed = axpy6(&bias, x[i], &self.columns[i]);
+                self.biases[parent] = add6(&self.biases[parent], &handed);
+            }
+        }
+        for i in 0..self.dof() {
+            let parent = self.bodies.links[i].parent;
+            let ahead = if parent == usize::MAX { [0.0; 6] } else { self.accelerations[parent] };
+            x[i] -= dot6(&self.columns[i], &ahead) * self.inverse[i];
+            self.accelerations[i] = axpy6(&ahead, x[i], &self.poses[i].twist);
+        }
     }
 
     #[inline(always)]
@@ -159,11 +160,11 @@ impl ArticulatedBody {
             let parent = self.bodies.links[i].parent;
             let ahead = if parent == usize::MAX { [0.0; 6] } else { self.velocities[parent] };
             let velocity = axpy6(&ahead, v[i], &pose.twist);
-            let own: V6 = pose.twist.map(|x| x * v[i]);
+            let own = array!(6, k => pose.twist[k] * v[i]);
             self.products[i] = bracket(&velocity, &own);
             let inertia: Inertia = self.bodies.inertia(i, pose);
             let mut bias = cross_wrench(&velocity, &inertia.times(&velocity));
-            let weight = self.bodies.gravity.map(|g| g * inertia.mass);
+            let weight = array!(3, k => self.bodies.gravity[k] * inertia.mass);
             let torque = cross(pose.com, weight);
             for k in 0..3 {
                 bias[k] -= torque[k];

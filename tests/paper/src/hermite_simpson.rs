@@ -9,6 +9,9 @@
 //! ID(q_m, v_m, a_m) = 0                         ID(q_1, v_1, a_1) = 0
 //! ```
 //!
+//! That is [`Layout::Reduced`]. [`Layout::Full`] keeps `q, v, a` of the middle and the end as `6n` unknowns with `4n` linear and `2n`
+//! dynamic equations, as collocation is usually transcribed; Newton's iterates are the same, only the linear systems are larger.
+//!
 //! `2n` unknowns, as many as the variational Simpson step, analytic derivatives of inverse dynamics, dense LU with pivoting. Start, use
 //! of the Jacobian (factorised once per step, renewed when the contraction is poor, Broyden's update) and stopping rule are the
 //! integrator's own ([`delmpc_mechanics::step`]), so that only the equations differ.
@@ -35,6 +38,15 @@ const Q_BY_A: [[f64; 3]; 2] = [[3.0 / 48.0, 4.0 / 48.0, -1.0 / 48.0], [1.0 / 6.0
 const V_BY_A: [[f64; 3]; 2] = [[5.0 / 24.0, 8.0 / 24.0, -1.0 / 24.0], [1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0]];
 /// Extrapolation of the parabola of accelerations by one step: rows middle and end.
 const EXTRAPOLATION: [[f64; 3]; 2] = [[1.0, -3.0, 3.0], [3.0, -8.0, 6.0]];
+
+/// Which unknowns the linear systems keep.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Layout {
+    /// Accelerations only: 2n.
+    Reduced,
+    /// Angles, rates and accelerations: 6n.
+    Full,
+}
 
 /// What a run took.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -64,7 +76,10 @@ pub struct HermiteSimpson {
     nodes: [InverseDynamics; 2],
     /// For the acceleration at the very start.
     start: ArticulatedBody,
+    layout: Layout,
     lu: PivotedLu,
+    /// Right-hand side of the full system.
+    full: Vec<f64>,
     /// Angles and rates.
     pub q: Vec<f64>,
     /// See [`Self::q`].
@@ -77,7 +92,7 @@ pub struct HermiteSimpson {
     node_q: Vec<f64>,
     node_v: Vec<f64>,
     has_previous: bool,
-    /// Since [`Self::begin`].
+    /// Spent since [`Self::begin`].
     pub effort: Effort,
 }
 
@@ -86,13 +101,16 @@ impl HermiteSimpson {
     ///
     /// # Errors
     /// [`RivalError::Unsupported`].
-    pub fn new(tree: &KinematicTree, time_step: f64) -> Result<Self, RivalError> {
+    pub fn new(tree: &KinematicTree, time_step: f64, layout: Layout) -> Result<Self, RivalError> {
         let n = tree.dof();
+        let order = if layout == Layout::Full { 6 * n } else { 2 * n };
         Ok(Self {
             time_step,
             nodes: [InverseDynamics::new(tree)?, InverseDynamics::new(tree)?],
             start: ArticulatedBody::new(tree)?,
-            lu: PivotedLu::new(2 * n),
+            layout,
+            lu: PivotedLu::new(order),
+            full: vec![0.0; order],
             q: vec![0.0; n],
             v: vec![0.0; n],
             a: vec![0.0; n],
@@ -104,11 +122,6 @@ impl HermiteSimpson {
             has_previous: false,
             effort: Effort::default(),
         })
-    }
-
-    /// Variables and equations of a step after elimination, and before it: `q, v, a` in the middle and at the end.
-    pub fn sizes(&self) -> [usize; 2] {
-        [self.unknowns.len(), 3 * self.unknowns.len()]
     }
 
     /// At angles and rates.
@@ -128,7 +141,7 @@ impl HermiteSimpson {
         let n = self.q.len();
         let (middle, end) = self.unknowns.split_at_mut(n);
         for i in 0..n {
-            // The polynomial of the last step: its start is in `node_q`'s place after the step.
+            // The parabola of the last step; its first acceleration is kept in the place of the middle rates.
             let (a0, am, a1) = (self.node_v[i], middle[i], self.a[i]);
             let next = |row: &[f64; 3]| row[0] * a0 + row[1] * am + row[2] * a1;
             (middle[i], end[i]) =
@@ -144,6 +157,23 @@ impl HermiteSimpson {
         }
         self.has_previous = true;
         Ok(())
+    }
+
+    /// Accelerations at the present state, rad/s².
+    pub fn acceleration(&self) -> &[f64] {
+        &self.a
+    }
+
+    /// `q`, `q̇`, `q̈` of the middle and the end of the last step, one after the other.
+    pub fn step_nodes(&self) -> [Vec<f64>; 3] {
+        let n = self.q.len();
+        // The middle of the rates made room for the old accelerations: Hermite's interpolation has it again.
+        let (before, middle, end) = (&self.node_v[..n], &self.unknowns[..n], &self.a);
+        let h = self.time_step;
+        let rate = (0..n).map(|i| self.v[i] - h * (-before[i] + 8.0 * middle[i] + 5.0 * end[i]) / 24.0);
+        let mut v: Vec<f64> = rate.collect();
+        v.extend_from_slice(&self.v);
+        [self.node_q.clone(), v, [middle, end].concat()]
     }
 
     /// Residuals of both nodes into `direction`.
@@ -171,6 +201,61 @@ impl HermiteSimpson {
     }
 
     fn factor(&mut self) -> bool {
+        self.effort.factorizations += 1;
+        match self.layout {
+            Layout::Reduced => self.factor_reduced(),
+            Layout::Full => self.factor_full(),
+        }
+    }
+
+    /// Columns `q_m, v_m, a_m, q_1, v_1, a_1`; rows: Hermite interpolation of `q, v`, dynamics, Simpson's rule of `q, v`, dynamics.
+    fn factor_full(&mut self) -> bool {
+        let n = self.q.len();
+        let h = self.time_step;
+        let columns = 6 * n;
+        self.lu.matrix.fill(0.0);
+        let matrix = &mut self.lu.matrix;
+        let mut diagonal = |row: usize, entries: &[(usize, f64)]| {
+            for &(column, value) in entries {
+                for i in 0..n {
+                    matrix[(row * n + i) * columns + column * n + i] = value;
+                }
+            }
+        };
+        diagonal(0, &[(0, 1.0), (3, -0.5), (4, h / 8.0)]);
+        diagonal(1, &[(1, 1.0), (4, -0.5), (5, h / 8.0)]);
+        diagonal(3, &[(3, 1.0), (1, -4.0 * h / 6.0), (4, -h / 6.0)]);
+        diagonal(4, &[(4, 1.0), (2, -4.0 * h / 6.0), (5, -h / 6.0)]);
+        for node in 0..2 {
+            self.nodes[node].differentiate();
+            let work = &self.nodes[node];
+            for (part, block) in [&work.by_q, &work.by_v, &work.by_a].into_iter().enumerate() {
+                for r in 0..n {
+                    let place = ((3 * node + 2) * n + r) * columns + (3 * node + part) * n;
+                    self.lu.matrix[place..place + n].copy_from_slice(&block[r * n..(r + 1) * n]);
+                }
+            }
+        }
+        self.lu.factor()
+    }
+
+    /// `direction := J⁻¹ direction`. The linear equations hold at every iterate: their residuals are zero.
+    fn solve(&mut self) {
+        let n = self.q.len();
+        match self.layout {
+            Layout::Reduced => self.lu.solve(&mut self.direction),
+            Layout::Full => {
+                self.full.fill(0.0);
+                self.full[2 * n..3 * n].copy_from_slice(&self.direction[..n]);
+                self.full[5 * n..].copy_from_slice(&self.direction[n..]);
+                self.lu.solve(&mut self.full);
+                self.direction[..n].copy_from_slice(&self.full[2 * n..3 * n]);
+                self.direction[n..].copy_from_slice(&self.full[5 * n..]);
+            }
+        }
+    }
+
+    fn factor_reduced(&mut self) -> bool {
         let n = self.q.len();
         let h = self.time_step;
         for node in 0..2 {
@@ -190,7 +275,6 @@ impl HermiteSimpson {
                 }
             }
         }
-        self.effort.factorizations += 1;
         self.lu.factor()
     }
 
@@ -208,7 +292,7 @@ impl HermiteSimpson {
                 }
                 remembered = 0;
             }
-            self.lu.solve(&mut self.direction);
+            self.solve();
             for x in &mut self.direction {
                 *x = -*x;
             }
@@ -229,7 +313,7 @@ impl HermiteSimpson {
                 || (iteration > 0 && change * contraction <= PREDICTED_CHANGE * size)
                 || (change < STAGNATION_CHANGE * size && contraction > 0.5)
             {
-                self.place_end();
+                self.place_nodes();
                 return Ok(());
             }
             fresh = contraction < RENEW_CONTRACTION || iteration == 0;
@@ -238,15 +322,18 @@ impl HermiteSimpson {
         Err(NotConverged { time_step: h, change: last, iterations: MAX_ITERATIONS })
     }
 
-    /// Angles and rates at the end; what the last change still moves.
-    fn place_end(&mut self) {
+    /// Angles and rates at the nodes; what the last change still moves.
+    fn place_nodes(&mut self) {
         let n = self.q.len();
         let h = self.time_step;
-        for i in 0..n {
-            let a = [self.a[i], self.unknowns[i], self.unknowns[n + i]];
-            let mean = |row: &[f64; 3]| row[0] * a[0] + row[1] * a[1] + row[2] * a[2];
-            self.node_q[n + i] = self.q[i] + h * (self.v[i] + h * mean(&Q_BY_A[1]));
-            self.node_v[n + i] = self.v[i] + h * mean(&V_BY_A[1]);
+        for node in 0..2 {
+            let c = [0.5, 1.0][node];
+            for i in 0..n {
+                let a = [self.a[i], self.unknowns[i], self.unknowns[n + i]];
+                let mean = |row: &[f64; 3]| row[0] * a[0] + row[1] * a[1] + row[2] * a[2];
+                self.node_q[node * n + i] = self.q[i] + h * (c * self.v[i] + h * mean(&Q_BY_A[node]));
+                self.node_v[node * n + i] = self.v[i] + h * mean(&V_BY_A[node]);
+            }
         }
     }
 
@@ -290,8 +377,8 @@ mod tests {
         let start = &initial_conditions(tree.dof(), 1, 0.8, 3)[0];
         let mut reference = Adaptive::new(&tree, Pair::Fehlberg78, 1e-14).unwrap();
         reference.run(&start.q, &start.v, 0.4).unwrap();
-        let error = |steps: usize| {
-            let mut work = HermiteSimpson::new(&tree, 0.4 / steps as f64).unwrap();
+        let error = |steps: usize, layout: Layout| {
+            let mut work = HermiteSimpson::new(&tree, 0.4 / steps as f64, layout).unwrap();
             work.begin(&start.q, &start.v);
             for _ in 0..steps {
                 work.step().unwrap();
@@ -299,10 +386,12 @@ mod tests {
             let off = |a: &[f64], b: &[f64]| a.iter().zip(b).fold(0.0f64, |m, (x, y)| m.max((x - y).abs()));
             (off(&work.q, reference.q()), off(&work.v, reference.v()))
         };
-        let (coarse, fine) = (error(40), error(80));
-        for (coarse, fine) in [(coarse.0, fine.0), (coarse.1, fine.1)] {
-            let order = (coarse / fine).log2();
-            assert!((3.8..4.2).contains(&order), "{order}: {coarse:e} {fine:e}");
+        for layout in [Layout::Reduced, Layout::Full] {
+            let (coarse, fine) = (error(40, layout), error(80, layout));
+            for (coarse, fine) in [(coarse.0, fine.0), (coarse.1, fine.1)] {
+                let order = (coarse / fine).log2();
+                assert!((3.8..4.2).contains(&order), "{layout:?} {order}: {coarse:e} {fine:e}");
+            }
         }
     }
 }

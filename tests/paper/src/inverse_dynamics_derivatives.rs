@@ -23,8 +23,8 @@
 use delmpc_mechanics::prelude::KinematicTree;
 
 use crate::rigid_bodies::{
-    Inertia, Pose, RigidBodies, RivalError, V6, add6, axpy6, bracket, cross, cross_wrench, dot6, halves,
-    join, rotate,
+    Inertia, Pose, RigidBodies, RivalError, V6, add6, array, axpy6, bracket, cross, cross_wrench, dot6,
+    halves, join, rotate, vectorized,
 };
 
 /// Workspace for one tree.
@@ -80,23 +80,20 @@ impl InverseDynamics {
 
     /// `τ`. O(n), no allocation.
     pub fn torque_into(&mut self, q: &[f64], v: &[f64], a: &[f64], out: &mut [f64]) {
-        self.arch.dispatch(
-            #[inline(always)]
-            || self.torque(q, v, a, out),
-        );
+        vectorized!(self.arch, (), (
+            work: &'a mut InverseDynamics = self, q: &'a [f64] = q, v: &'a [f64] = v, a: &'a [f64] = a,
+            out: &'a mut [f64] = out
+        ) => work.torque(q, v, a, out));
     }
 
     /// Derivatives at the arguments of the last [`Self::torque_into`]. O(n depth), no allocation.
     pub fn differentiate(&mut self) {
-        self.arch.dispatch(
-            #[inline(always)]
-            || self.derivatives(),
-        );
+        vectorized!(self.arch, (), (work: &'a mut InverseDynamics = self) => work.derivatives());
     }
 
     #[inline(always)]
     fn torque(&mut self, q: &[f64], v: &[f64], a: &[f64], out: &mut [f64]) {
-        let gravity = self.bodies.gravity.map(|g| -g);
+        let gravity = array!(3, k => -self.bodies.gravity[k]);
         for i in 0..self.bodies.dof() {
             let parent = self.bodies.links[i].parent;
             let (pose, velocity, acceleration) = if parent == usize::MAX {
@@ -143,7 +140,7 @@ impl InverseDynamics {
             let moved = add6(&self.inertias[j].times(&self.seconds[j]), &self.forth(j, &rate));
             let by_q: V6 = {
                 let carried = dual_bracket(&self.wrenches[j], &twist);
-                core::array::from_fn(|k| moved[k] - carried[k])
+                array!(6, k => moved[k] - carried[k])
             };
             let by_v = axpy6(&self.forth(j, &twist), 2.0, &self.inertias[j].times(&rate));
             let back = self.back(j, &twist);
@@ -159,9 +156,8 @@ impl InverseDynamics {
                 let inertia = dot6(above, &by_a);
                 self.by_a[i * n + j] = inertia;
                 self.by_a[j * n + i] = inertia;
-                let angular = |x: &V6| back[0].mul_add(x[0], back[1].mul_add(x[1], back[2] * x[2]));
-                self.by_q[j * n + i] = dot6(&by_a, &self.seconds[i]) + angular(above_rate);
-                self.by_v[j * n + i] = 2.0f64.mul_add(dot6(&by_a, above_rate), angular(above));
+                self.by_q[j * n + i] = dot6(&by_a, &self.seconds[i]) + dot3(&back, above_rate);
+                self.by_v[j * n + i] = 2.0f64.mul_add(dot6(&by_a, above_rate), dot3(&back, above));
                 i = self.bodies.links[i].parent;
             }
             if parent != usize::MAX {
@@ -181,7 +177,10 @@ impl InverseDynamics {
     #[inline(always)]
     fn forth(&self, j: usize, x: &V6) -> V6 {
         let (omega, _) = halves(x);
-        join(rotate(&self.w[j], omega), cross(self.p[j], omega).map(|y| -2.0 * y))
+        {
+            let turn = cross(self.p[j], omega);
+            join(rotate(&self.w[j], omega), array!(3, k => -2.0 * turn[k]))
+        }
     }
 
     /// Angular part of `Bᵀ S`, the rest is zero.
@@ -190,9 +189,7 @@ impl InverseDynamics {
         let (s, n) = halves(twist);
         let w = &self.w[j];
         let turn = cross(self.p[j], n);
-        core::array::from_fn(|k| {
-            w[k].mul_add(s[0], w[3 + k].mul_add(s[1], w[6 + k].mul_add(s[2], 2.0 * turn[k])))
-        })
+        array!(3, k => w[k].mul_add(s[0], w[3 + k].mul_add(s[1], w[6 + k].mul_add(s[2], 2.0 * turn[k]))))
     }
 }
 
@@ -205,17 +202,27 @@ fn rate_of_inertia(inertia: &Inertia, velocity: &V6) -> ([f64; 9], [f64; 3]) {
     let (angular, linear) = halves(&inertia.times(velocity));
     // ω^J - Jω^ = ω^J + (ω^J)ᵀ.
     let j = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
-    let c: [[f64; 3]; 3] = core::array::from_fn(|k| cross([x, y, z], j[k]));
+    let turn = [x, y, z];
+    let c = [cross(turn, j[0]), cross(turn, j[1]), cross(turn, j[2])];
     // -u^h^ - h^u^ = 2 u·h 1 - u hᵀ - h uᵀ.
     let (u, h) = ([ux, uy, uz], [hx, hy, hz]);
     let twice = 2.0 * (ux * hx + uy * hy + uz * hz);
-    let symmetric = |a: usize, b: usize| {
-        let spread = if a == b { twice } else { 0.0 };
-        c[b][a] + c[a][b] + spread - u[a] * h[b] - h[a] * u[b]
-    };
     let [lx, ly, lz] = angular;
     let skew = [0.0, -lz, ly, lz, 0.0, -lx, -ly, lx, 0.0];
-    (core::array::from_fn(|k| symmetric(k / 3, k % 3) - skew[k]), linear)
+    let mut w = [0.0; 9];
+    for a in 0..3 {
+        for b in 0..3 {
+            let spread = if a == b { twice } else { 0.0 };
+            w[3 * a + b] = c[b][a] + c[a][b] + spread - u[a] * h[b] - h[a] * u[b] - skew[3 * a + b];
+        }
+    }
+    (w, linear)
+}
+
+/// Scalar product with the angular part.
+#[inline(always)]
+fn dot3(a: &[f64; 3], x: &V6) -> f64 {
+    a[0].mul_add(x[0], a[1].mul_add(x[1], a[2] * x[2]))
 }
 
 /// `ad^D_F x = [τ×x_ω + f×x_v; f×x_ω]`.
@@ -224,7 +231,7 @@ fn dual_bracket(wrench: &V6, x: &V6) -> V6 {
     let (torque, force) = halves(wrench);
     let (omega, linear) = halves(x);
     let (a, b) = (cross(torque, omega), cross(force, linear));
-    join(core::array::from_fn(|k| a[k] + b[k]), cross(force, omega))
+    join(array!(3, k => a[k] + b[k]), cross(force, omega))
 }
 
 #[cfg(test)]

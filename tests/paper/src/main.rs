@@ -20,9 +20,12 @@
 
 mod articulated_body;
 mod automatic;
+mod constrained;
+mod energy;
 mod exact_newton;
 mod figure1;
 mod figure2;
+mod figure3;
 mod hermite_simpson;
 mod inverse_dynamics_derivatives;
 mod one_step;
@@ -34,6 +37,8 @@ mod results;
 mod rigid_bodies;
 mod runge_kutta;
 mod stopwatch;
+mod table1;
+mod trajectory;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -56,7 +61,7 @@ struct Arguments {
     /// Where the results go.
     #[arg(long, default_value = "runs/paper")]
     out: PathBuf,
-    /// Only these parts (figure1, figure2, figure3, beyond, constrained).
+    /// Only these parts (figure1, figure2, figure3, table1, beyond, energy, constrained).
     #[arg(long, value_delimiter = ',')]
     only: Vec<String>,
     /// Seed of the initial conditions.
@@ -77,6 +82,14 @@ enum Failure {
     Rival(#[from] rigid_bodies::RivalError),
     #[error(transparent)]
     Plot(#[from] plot::PlotError),
+    #[error(transparent)]
+    Collocation(#[from] hermite_simpson::NotConverged),
+    #[error(transparent)]
+    Adaptive(#[from] runge_kutta::StepTooSmall),
+    #[error(
+        "Gauss-Legendre with steps of {time_step} s: the fixed-point iteration does not converge; take smaller steps"
+    )]
+    FixedPoint { time_step: f64 },
     #[error("{path}: {error}; is the folder writable?")]
     Write { path: PathBuf, error: std::io::Error },
 }
@@ -110,8 +123,15 @@ impl Campaign {
 type Runner = fn(&Campaign) -> Result<Part, Failure>;
 
 /// Parts with their share of the bar.
-const PARTS: [(&str, usize, Runner); 2] =
-    [("figure1", figure1::CELLS, figure1::run), ("figure2", figure2::CELLS, figure2::run)];
+const PARTS: [(&str, usize, Runner); 7] = [
+    ("figure1", figure1::CELLS, figure1::run),
+    ("figure2", figure2::CELLS, figure2::run),
+    ("figure3", figure3::CELLS[0], figure3::run),
+    ("table1", 1, table1::run),
+    ("beyond", figure3::CELLS[1], figure3::beyond),
+    ("energy", energy::CELLS, energy::run),
+    ("constrained", constrained::CELLS, constrained::run),
+];
 
 fn campaign(arguments: &Arguments) -> Result<Vec<Claim>, Failure> {
     let out = &arguments.out;

@@ -1,5 +1,7 @@
 //! Small dense LU with partial pivoting, rows of equal length in one array; the passes run with the widest instructions.
 
+use crate::rigid_bodies::vectorized;
+
 /// Factors of a square matrix.
 #[derive(Clone, Debug)]
 pub struct PivotedLu {
@@ -18,59 +20,59 @@ impl PivotedLu {
 
     /// Factorises [`Self::matrix`] in place. `false` if it is singular to the last bit. No allocation.
     pub fn factor(&mut self) -> bool {
-        let (n, matrix, pivots) = (self.order, &mut self.matrix, &mut self.pivots);
-        self.arch.dispatch(
-            #[inline(always)]
-            || {
-                for k in 0..n {
-                    let mut pivot = k;
-                    for r in k + 1..n {
-                        if matrix[r * n + k].abs() > matrix[pivot * n + k].abs() {
-                            pivot = r;
-                        }
-                    }
-                    pivots[k] = pivot;
-                    let (top, rest) = matrix.split_at_mut((k + 1) * n);
-                    if pivot != k {
-                        let start = (pivot - k - 1) * n;
-                        top[k * n..].swap_with_slice(&mut rest[start..start + n]);
-                    }
-                    let row = &top[k * n..];
-                    if row[k] == 0.0 {
-                        return false;
-                    }
-                    let inverse = 1.0 / row[k];
-                    for below in rest.chunks_exact_mut(n) {
-                        let factor = below[k] * inverse;
-                        below[k] = factor;
-                        for (x, y) in below[k + 1..].iter_mut().zip(&row[k + 1..]) {
-                            *x = (-factor).mul_add(*y, *x);
-                        }
-                    }
-                }
-                true
-            },
-        )
+        vectorized!(self.arch, bool, (work: &'a mut PivotedLu = self) => work.eliminate())
     }
 
     /// `x := A⁻¹ x`. No allocation.
     pub fn solve(&self, x: &mut [f64]) {
+        vectorized!(self.arch, (), (work: &'a PivotedLu = self, x: &'a mut [f64] = x) => work.substitute(x));
+    }
+
+    #[inline(always)]
+    fn eliminate(&mut self) -> bool {
+        let (n, matrix, pivots) = (self.order, &mut self.matrix, &mut self.pivots);
+        for k in 0..n {
+            let mut pivot = k;
+            for r in k + 1..n {
+                if matrix[r * n + k].abs() > matrix[pivot * n + k].abs() {
+                    pivot = r;
+                }
+            }
+            pivots[k] = pivot;
+            let (top, rest) = matrix.split_at_mut((k + 1) * n);
+            if pivot != k {
+                let start = (pivot - k - 1) * n;
+                top[k * n..].swap_with_slice(&mut rest[start..start + n]);
+            }
+            let row = &top[k * n..];
+            if row[k] == 0.0 {
+                return false;
+            }
+            let inverse = 1.0 / row[k];
+            for below in rest.chunks_exact_mut(n) {
+                let factor = below[k] * inverse;
+                below[k] = factor;
+                for (x, y) in below[k + 1..].iter_mut().zip(&row[k + 1..]) {
+                    *x = (-factor).mul_add(*y, *x);
+                }
+            }
+        }
+        true
+    }
+
+    #[inline(always)]
+    fn substitute(&self, x: &mut [f64]) {
         let (n, matrix, pivots) = (self.order, &self.matrix, &self.pivots);
-        self.arch.dispatch(
-            #[inline(always)]
-            || {
-                for k in 0..n {
-                    x.swap(k, pivots[k]);
-                }
-                for k in 0..n {
-                    x[k] -= inner(&matrix[k * n..k * n + k], &x[..k]);
-                }
-                for k in (0..n).rev() {
-                    let rest = inner(&matrix[k * n + k + 1..(k + 1) * n], &x[k + 1..n]);
-                    x[k] = (x[k] - rest) / matrix[k * n + k];
-                }
-            },
-        );
+        for k in 0..n {
+            x.swap(k, pivots[k]);
+        }
+        for k in 0..n {
+            x[k] -= inner(&matrix[k * n..k * n + k], &x[..k]);
+        }
+        for k in (0..n).rev() {
+            let rest = inner(&matrix[k * n + k + 1..(k + 1) * n], &x[k + 1..n]);
+            x[k] = (x[k] - rest) / matrix[k * n + k];
+        }
     }
 }
 
@@ -79,7 +81,10 @@ impl PivotedLu {
 fn inner(a: &[f64], b: &[f64]) -> f64 {
     let mut sums = [0.0f64; 4];
     let (whole, rest) = (a.chunks_exact(4), b.chunks_exact(4));
-    let tail: f64 = whole.remainder().iter().zip(rest.remainder()).map(|(x, y)| x * y).sum();
+    let mut tail = 0.0f64;
+    for (x, y) in whole.remainder().iter().zip(rest.remainder()) {
+        tail = x.mul_add(*y, tail);
+    }
     for (x, y) in whole.zip(rest) {
         for k in 0..4 {
             sums[k] = x[k].mul_add(y[k], sums[k]);

@@ -21,6 +21,10 @@ pub enum Scale {
 pub enum Style {
     /// A line with a mark at every point.
     Mark,
+    /// A line without marks.
+    Line,
+    /// A line with an open mark at every point.
+    Hollow,
     /// A dashed line.
     Dashed,
     /// Marks only.
@@ -194,6 +198,13 @@ fn draw_panel<B: DrawingBackend>(
                 chart.draw_series(points.iter().map(|&p| Circle::new(p, radius, colour.filled())))?;
                 chart.draw_series(LineSeries::new(points, stroke))?
             }
+            Style::Hollow => {
+                let thin = ShapeStyle::from(&colour).stroke_width(px(1.4) as u32);
+                chart.draw_series(DashedLineSeries::new(points.clone(), px(9.0), px(3.0), thin))?;
+                chart.draw_series(points.iter().map(|&p| Circle::new(p, radius, WHITE.filled())))?;
+                chart.draw_series(points.iter().map(|&p| Circle::new(p, radius, stroke)))?
+            }
+            Style::Line => chart.draw_series(LineSeries::new(points, stroke))?,
             Style::Dashed => chart.draw_series(DashedLineSeries::new(points, px(7.0), px(5.0), stroke))?,
             Style::Points => {
                 let thick = ShapeStyle::from(&colour).stroke_width(px(2.0) as u32);
@@ -239,6 +250,11 @@ fn legend_parts(
             let dot = Circle::new((px(13.0), 0), px(3.8), colour.filled());
             (path((0.0, 0.0), (13.0, 0.0)), path((13.0, 0.0), (26.0, 0.0)), dot)
         }
+        Style::Hollow => {
+            let dot = Circle::new((px(13.0), 0), px(3.8), stroke);
+            (path((0.0, 0.0), (9.0, 0.0)), path((17.0, 0.0), (26.0, 0.0)), dot)
+        }
+        Style::Line => (path((0.0, 0.0), (13.0, 0.0)), path((13.0, 0.0), (26.0, 0.0)), none),
         Style::Dashed => (path((0.0, 0.0), (10.0, 0.0)), path((16.0, 0.0), (26.0, 0.0)), none),
         Style::Points => (path((8.0, -5.0), (18.0, 5.0)), path((8.0, 5.0), (18.0, -5.0)), none),
     }

@@ -76,6 +76,40 @@ pub struct RigidBodies {
     pub gravity: [f64; 3],
 }
 
+/// Runs an expression with the widest instructions of the processor. A type of its own instead of a closure, for the reason told at
+/// [`array!`]. Everything it calls has to be `#[inline(always)]`.
+macro_rules! vectorized {
+    ($arch:expr, $output:ty, ($($name:ident: $kind:ty = $value:expr),+) => $body:expr) => {{
+        struct Kernel<'a> {
+            $($name: $kind,)+
+        }
+        impl<'a> pulp::WithSimd for Kernel<'a> {
+            type Output = $output;
+            #[inline(always)]
+            fn with_simd<S: pulp::Simd>(self, _: S) -> $output {
+                let Self { $($name,)+ } = self;
+                $body
+            }
+        }
+        let arch = $arch;
+        arch.dispatch(Kernel { $($name: $value,)+ })
+    }};
+}
+pub(crate) use vectorized;
+
+/// An array by a formula of its index. A loop instead of a closure: closures handed to the library's functions are compiled without
+/// the instructions of the caller, and a fused multiply-add is then a function call.
+macro_rules! array {
+    ($n:literal, $k:ident => $value:expr) => {{
+        let mut out = [0.0f64; $n];
+        for $k in 0..$n {
+            out[$k] = $value;
+        }
+        out
+    }};
+}
+pub(crate) use array;
+
 /// `a × b`.
 #[inline(always)]
 pub fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
@@ -89,7 +123,7 @@ pub fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
 /// `A b` of a 3x3 matrix by rows.
 #[inline(always)]
 pub fn rotate(a: &[f64; 9], b: [f64; 3]) -> [f64; 3] {
-    core::array::from_fn(|r| a[3 * r].mul_add(b[0], a[3 * r + 1].mul_add(b[1], a[3 * r + 2] * b[2])))
+    array!(3, r => a[3 * r].mul_add(b[0], a[3 * r + 1].mul_add(b[1], a[3 * r + 2] * b[2])))
 }
 
 /// `ad_v x` of twists: `[ω×a; ω×b + u×a]` with `v = [ω; u]`, `x = [a; b]`.
@@ -128,13 +162,13 @@ fn add3(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
 /// `a + b`.
 #[inline(always)]
 pub fn add6(a: &V6, b: &V6) -> V6 {
-    core::array::from_fn(|k| a[k] + b[k])
+    array!(6, k => a[k] + b[k])
 }
 
 /// `a + x b`.
 #[inline(always)]
 pub fn axpy6(a: &V6, x: f64, b: &V6) -> V6 {
-    core::array::from_fn(|k| x.mul_add(b[k], a[k]))
+    array!(6, k => x.mul_add(b[k], a[k]))
 }
 
 /// `a · b`.
@@ -154,7 +188,7 @@ pub fn symmetric_times(a: &M6, x: &V6) -> V6 {
             sum[c] = x[k].mul_add(a[k][c], sum[c]);
         }
     }
-    core::array::from_fn(|k| sum[k])
+    [sum[0], sum[1], sum[2], sum[3], sum[4], sum[5]]
 }
 
 /// The ten numbers of a spatial inertia.
@@ -216,6 +250,13 @@ impl Inertia {
     }
 }
 
+/// Row a of one matrix times row b of another.
+#[inline(always)]
+fn row_product(x: &[f64; 9], y: &[f64; 9], a: usize, b: usize) -> f64 {
+    let (a, b) = (3 * a, 3 * b);
+    x[a].mul_add(y[b], x[a + 1].mul_add(y[b + 1], x[a + 2] * y[b + 2]))
+}
+
 impl RigidBodies {
     /// The arrays of a tree.
     ///
@@ -261,18 +302,20 @@ impl RigidBodies {
     pub fn pose(&self, i: usize, q: f64, parent: Option<&Pose>) -> Pose {
         let link = &self.links[i];
         let (sin, cos) = q.sin_cos();
-        let turn: [f64; 9] =
-            core::array::from_fn(|k| sin.mul_add(link.e2[k], cos.mul_add(link.e1[k], link.e0[k])));
+        let turn = array!(9, k => sin.mul_add(link.e2[k], cos.mul_add(link.e1[k], link.e0[k])));
         let (rotation, origin) = match parent {
             None => (turn, link.origin),
-            Some(parent) => (
-                core::array::from_fn(|k| {
-                    let (r, c) = (3 * (k / 3), k % 3);
-                    let m = &parent.rotation;
-                    m[r].mul_add(turn[c], m[r + 1].mul_add(turn[3 + c], m[r + 2] * turn[6 + c]))
-                }),
-                add3(parent.origin, rotate(&parent.rotation, link.origin)),
-            ),
+            Some(parent) => {
+                let mut rotation = [0.0; 9];
+                for r in [0, 3, 6] {
+                    for c in 0..3 {
+                        let m = &parent.rotation;
+                        rotation[r + c] =
+                            m[r].mul_add(turn[c], m[r + 1].mul_add(turn[3 + c], m[r + 2] * turn[6 + c]));
+                    }
+                }
+                (rotation, add3(parent.origin, rotate(&parent.rotation, link.origin)))
+            }
         };
         let axis = rotate(&rotation, link.axis);
         Pose {
@@ -289,15 +332,15 @@ impl RigidBodies {
         let link = &self.links[i];
         let [xx, yy, zz, xy, xz, yz] = link.inertia;
         let r = &pose.rotation;
+        let rows = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
         // R I, then its product with Rᵀ.
-        let ri: [f64; 9] = core::array::from_fn(|k| {
-            let row = &r[3 * (k / 3)..3 * (k / 3) + 3];
-            let column = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]][k % 3];
-            row[0].mul_add(column[0], row[1].mul_add(column[1], row[2] * column[2]))
-        });
-        let product = |a: usize, b: usize| {
-            ri[3 * a].mul_add(r[3 * b], ri[3 * a + 1].mul_add(r[3 * b + 1], ri[3 * a + 2] * r[3 * b + 2]))
-        };
+        let mut ri = [0.0; 9];
+        for k in [0, 3, 6] {
+            for c in 0..3 {
+                let column = rows[c];
+                ri[k + c] = r[k].mul_add(column[0], r[k + 1].mul_add(column[1], r[k + 2] * column[2]));
+            }
+        }
         let [x, y, z] = pose.com;
         let m = link.mass;
         let (mx, my, mz) = (m * x, m * y, m * z);
@@ -305,12 +348,12 @@ impl RigidBodies {
             mass: m,
             first_moment: [mx, my, mz],
             rotational: [
-                my.mul_add(y, mz.mul_add(z, product(0, 0))),
-                mx.mul_add(x, mz.mul_add(z, product(1, 1))),
-                mx.mul_add(x, my.mul_add(y, product(2, 2))),
-                (-mx).mul_add(y, product(0, 1)),
-                (-mx).mul_add(z, product(0, 2)),
-                (-my).mul_add(z, product(1, 2)),
+                my.mul_add(y, mz.mul_add(z, row_product(&ri, r, 0, 0))),
+                mx.mul_add(x, mz.mul_add(z, row_product(&ri, r, 1, 1))),
+                mx.mul_add(x, my.mul_add(y, row_product(&ri, r, 2, 2))),
+                (-mx).mul_add(y, row_product(&ri, r, 0, 1)),
+                (-mx).mul_add(z, row_product(&ri, r, 0, 2)),
+                (-my).mul_add(z, row_product(&ri, r, 1, 2)),
             ],
         }
     }

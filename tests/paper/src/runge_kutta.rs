@@ -14,7 +14,7 @@
 use delmpc_mechanics::prelude::KinematicTree;
 
 use crate::articulated_body::ArticulatedBody;
-use crate::rigid_bodies::RivalError;
+use crate::rigid_bodies::{RivalError, vectorized};
 
 /// An embedded pair.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -206,22 +206,20 @@ impl Stages {
 
     /// `next := state + h Σ weights slopes`.
     fn combine(&mut self, h: f64, weights: &[f64]) {
-        let (next, slopes) = (&mut self.next, &self.slopes);
-        let state = &self.state;
-        self.arch.dispatch(
-            #[inline(always)]
-            || {
-                next.copy_from_slice(state);
-                for (weight, slope) in weights.iter().zip(slopes) {
-                    if *weight != 0.0 {
-                        let factor = h * weight;
-                        for (x, k) in next.iter_mut().zip(slope) {
-                            *x = factor.mul_add(*k, *x);
-                        }
+        vectorized!(self.arch, (), (
+            next: &'a mut [f64] = &mut self.next, state: &'a [f64] = &self.state, slopes: &'a [Vec<f64>] = &self.slopes,
+            h: f64 = h, weights: &'a [f64] = weights
+        ) => {
+            next.copy_from_slice(state);
+            for (weight, slope) in weights.iter().zip(slopes) {
+                if *weight != 0.0 {
+                    let factor = h * weight;
+                    for (x, k) in next.iter_mut().zip(slope) {
+                        *x = factor.mul_add(*k, *x);
                     }
                 }
-            },
-        );
+            }
+        });
     }
 
     /// All stages; the solution is then in `next`. `first_known`: stage 0 is up to date.
