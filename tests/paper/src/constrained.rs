@@ -137,6 +137,7 @@ pub fn run(campaign: &Campaign) -> Result<Part, Failure> {
         y_label: y_label.into(),
         x: Scale::Log,
         y: Scale::Log,
+        x_range: None,
         y_range: None,
         lines,
         legend: true,

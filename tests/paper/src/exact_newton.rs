@@ -13,11 +13,12 @@
 //! 0.88, 0.43, 0.21; continuation in the time step 0.97, 0.66, 0.38 at up to nine times the time; every angle limited by itself 0.90,
 //! 0.53, 0.25; plain from a Runge-Kutta step 0.87, 0.45, 0.21.
 //!
-//! `J` is factorised anew unless the last change was ten times smaller than the one before: what is left is then gone with the factors
-//! at hand.
+//! `J` is factorised in the first iteration, and again when the change was limited or did not become ten times smaller; in between
+//! [`crate::broyden`] makes the best of the factors, as in the integrator. The plain method and the second attempt factorise always.
 
 use delmpc_mechanics::newton_direction::{NewtonDirection, NewtonMethod, NewtonSolver};
 
+use crate::broyden::Broyden;
 use crate::one_step::{OneStep, Outcome, Progress};
 
 /// Iterations of the limited method from either start.
@@ -34,6 +35,7 @@ const KEEP: f64 = 0.1;
 pub struct ExactNewton {
     solver: NewtonSolver,
     change: Vec<f64>,
+    broyden: Broyden,
     limit: f64,
 }
 
@@ -43,6 +45,7 @@ impl ExactNewton {
         Self {
             solver: NewtonSolver::new(method, &problem.tree, &problem.del),
             change: vec![0.0; problem.tree.dof()],
+            broyden: Broyden::new(problem.tree.dof()),
             limit,
         }
     }
@@ -50,9 +53,9 @@ impl ExactNewton {
     /// Solves a step that has begun; if that fails, once more by way of half the step. No allocation.
     pub fn solve(&mut self, problem: &mut OneStep) -> Outcome {
         if self.limit.is_infinite() {
-            return self.iterate(problem, 0, MAX_PLAIN_ITERATIONS);
+            return self.iterate(problem, 0, MAX_PLAIN_ITERATIONS, false);
         }
-        match self.iterate(problem, 0, MAX_ITERATIONS) {
+        match self.iterate(problem, 0, MAX_ITERATIONS, true) {
             Outcome::Failed => self.continue_from_half(problem),
             solved => solved,
         }
@@ -63,9 +66,11 @@ impl ExactNewton {
         if !problem.halve() {
             return Outcome::Failed;
         }
-        let half = self.iterate(problem, MAX_ITERATIONS, MAX_ITERATIONS);
+        let half = self.iterate(problem, MAX_ITERATIONS, MAX_ITERATIONS, false);
         match half {
-            Outcome::Solved(before) if problem.restore() => self.iterate(problem, before, MAX_ITERATIONS),
+            Outcome::Solved(before) if problem.restore() => {
+                self.iterate(problem, before, MAX_ITERATIONS, false)
+            }
             _ => {
                 problem.restore();
                 Outcome::Failed
@@ -73,7 +78,8 @@ impl ExactNewton {
         }
     }
 
-    fn iterate(&mut self, problem: &mut OneStep, before: usize, most: usize) -> Outcome {
+    /// `thrifty`: keeps factors where it may; otherwise every iteration has its own.
+    fn iterate(&mut self, problem: &mut OneStep, before: usize, most: usize, thrifty: bool) -> Outcome {
         let mut last = f64::INFINITY;
         let mut keep = false;
         for iteration in 0..most {
@@ -82,15 +88,21 @@ impl ExactNewton {
                 Progress::Lost => return Outcome::Failed,
                 Progress::Open => {}
             }
-            if !keep && self.solver.factor(&problem.tree, &problem.del).is_err() {
-                return Outcome::Failed;
+            if !keep {
+                if self.solver.factor(&problem.tree, &problem.del).is_err() {
+                    return Outcome::Failed;
+                }
+                self.broyden.forget();
             }
-            self.change.copy_from_slice(&problem.residual);
+            for (x, r) in self.change.iter_mut().zip(&problem.residual) {
+                *x = -r;
+            }
             self.solver.solve(&problem.tree, &mut self.change);
+            self.broyden.improve(&mut self.change);
             let largest = self.change.iter().fold(0.0f64, |m, x| m.max(x.abs()));
-            keep = largest < KEEP * last && last < self.limit;
+            keep = thrifty && largest < self.limit && (iteration == 0 || largest < KEEP * last);
             last = largest;
-            problem.step(-(self.limit / largest).min(1.0), &self.change);
+            problem.step((self.limit / largest).min(1.0), &self.change);
         }
         Outcome::Failed
     }

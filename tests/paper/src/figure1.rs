@@ -31,7 +31,6 @@ const HARD_FROM: f64 = 0.02;
 const QUASI: usize = 0;
 const PLAIN: usize = 1;
 const NEWTON: usize = 2;
-const BRANCH: usize = 3;
 const METHODS: [(&str, &str); 4] = [
     ("quasi_newton", "quasi-Newton (RIQN)"),
     ("newton_plain", "Newton, B.1, plain"),
@@ -322,6 +321,7 @@ fn panels_of(links: Links, rows: &[(f64, [Cell; 4])]) -> Vec<Panel> {
         y_label: y_label.into(),
         x: Scale::Linear,
         y,
+        x_range: None,
         y_range: None,
         lines,
         legend: true,

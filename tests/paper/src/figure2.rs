@@ -339,6 +339,7 @@ fn figure(sizes: &[Size]) -> Figure {
             y_label: "time (µs)".into(),
             x: Scale::Log,
             y: Scale::Log,
+            x_range: None,
             y_range: None,
             legend: true,
             lines: RIVALS

@@ -53,7 +53,7 @@ struct Problem {
 }
 
 impl Problem {
-    fn new(campaign: &Campaign, samples: usize, compared: usize) -> Result<Self, Failure> {
+    fn new(campaign: &Campaign, samples: usize, compared: usize, repeats: usize) -> Result<Self, Failure> {
         let tree = pendulum(Links::Rods, LINKS)?;
         let duration = if campaign.quick { 1.0 } else { 10.0 };
         let initial = initial_conditions(LINKS, samples, SPREAD, campaign.seed);
@@ -68,7 +68,6 @@ impl Problem {
             }
             reference.push(end.q);
         }
-        let repeats = if campaign.quick { 1 } else { 2 };
         Ok(Self { tree, initial, reference, uncertainty: median(apart), duration, repeats })
     }
 
@@ -169,6 +168,7 @@ fn panel(title: &str, x_label: &str, y_label: &str, lines: Vec<Line>) -> Panel {
         y_label: y_label.into(),
         x: Scale::Log,
         y: Scale::Log,
+        x_range: None,
         y_range: None,
         lines,
         legend: true,
@@ -185,7 +185,7 @@ pub const CELLS: [usize; 2] = [12, 30];
 pub fn run(campaign: &Campaign) -> Result<Part, Failure> {
     campaign.say("figure 3: reference");
     let samples = if campaign.quick { 2 } else { 100 };
-    let problem = Problem::new(campaign, samples, 3)?;
+    let problem = Problem::new(campaign, samples, 3, 1)?;
     let levels = if campaign.quick { 3 } else { 5 };
     let mut curves = Vec::new();
     for method in [Method::Variational(2), Method::HermiteSimpson, Method::HermiteSimpsonFull] {
@@ -260,14 +260,31 @@ pub fn run(campaign: &Campaign) -> Result<Part, Failure> {
     Ok(part)
 }
 
+/// Orders of the variational integrators, on a motion short enough that errors are still errors and not chaos.
+fn orders(campaign: &Campaign) -> Result<Vec<(usize, f64)>, Failure> {
+    let tree = pendulum(Links::Rods, LINKS)?;
+    let initial = &initial_conditions(LINKS, 1, SPREAD, campaign.seed)[0];
+    let reference = integrate(&tree, Method::Variational(REFERENCE_NODES), REFERENCE_STEP, initial, 1.0)?.q;
+    let mut list = Vec::new();
+    for (s, steps) in [(1, 800.0), (2, 200.0), (3, 100.0), (4, 50.0)] {
+        let mut points = Vec::new();
+        for step in [1.0 / steps, 0.5 / steps] {
+            let end = integrate(&tree, Method::Variational(s), step, initial, 1.0)?;
+            points.push((step, distance(&end.q, &reference)));
+        }
+        list.push((s, exponent(&points)));
+    }
+    Ok(list)
+}
+
 /// Beyond the paper: all orders against Runge-Kutta methods on articulated bodies.
 ///
 /// # Errors
 /// As [`run`].
 pub fn beyond(campaign: &Campaign) -> Result<Part, Failure> {
     campaign.say("beyond: reference");
-    let samples = if campaign.quick { 1 } else { 15 };
-    let problem = Problem::new(campaign, samples, samples)?;
+    let samples = if campaign.quick { 1 } else { 10 };
+    let problem = Problem::new(campaign, samples, samples, if campaign.quick { 1 } else { 3 })?;
     let first = if campaign.quick { 0.025 } else { 0.05 };
     let levels = |full: usize| if campaign.quick { 2 } else { full };
     let tolerances: Vec<f64> =
@@ -319,14 +336,12 @@ pub fn beyond(campaign: &Campaign) -> Result<Part, Failure> {
             1.0,
         ));
     }
-    for s in 1..=4 {
-        if let Some(curve) = curves.iter().find(|c| c.method == Method::Variational(s)) {
-            part.claims.push(Claim::at_least(
-                format!("order of the variational integrator with s = {s}"),
-                order(curve, 1e-10, [0.1, 1e-2, 1e-2, 1e-2][s - 1]),
-                2.0 * s as f64 - 0.3,
-            ));
-        }
+    for (s, order) in orders(campaign)? {
+        part.claims.push(Claim::at_least(
+            format!("order of the variational integrator with s = {s}, over 1 s"),
+            order,
+            2.0 * s as f64 - 0.5,
+        ));
     }
     part.facts = json!({
         "links": LINKS, "samples": samples, "duration_s": problem.duration,

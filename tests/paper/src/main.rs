@@ -8,9 +8,14 @@
 //! | module | what |
 //! |---|---|
 //! | [`figure1`] | trapezoidal steps: Newton against quasi-Newton |
-//! | problems | [`pendulum`], [`one_step`] |
-//! | rivals | [`quasi_newton`], [`articulated_body`] |
-//! | ours | [`exact_newton`] over `delmpc-mechanics` |
+//! | [`figure2`] | evaluation, Newton direction, linearisation against automatic differentiation |
+//! | [`figure3`] | Simpson against Hermite-Simpson; beyond: all orders against Runge-Kutta methods |
+//! | [`table1`] | variables and equations of the transcriptions, counted on built problems |
+//! | [`energy`], [`constrained`] | beyond: energy over 100 s; orders with the tip pinned |
+//! | problems | [`pendulum`], [`one_step`], [`trajectory`] |
+//! | rivals | [`quasi_newton`], [`automatic`], [`hermite_simpson`], [`runge_kutta`] on [`articulated_body`], [`inverse_dynamics_derivatives`] |
+//! | their tools | [`rigid_bodies`], [`pivoted_lu`], [`broyden`] |
+//! | ours | [`exact_newton`] and the integrators of `delmpc-mechanics` |
 //! | output | [`plot`], [`results`], [`stopwatch`] |
 //!
 //! Everything runs on one core, in one process, rivals and integrator in turn. `paper.json` holds every claim with its bar and whether it
@@ -20,6 +25,7 @@
 
 mod articulated_body;
 mod automatic;
+mod broyden;
 mod constrained;
 mod energy;
 mod exact_newton;

@@ -1,9 +1,11 @@
 //! Line plots as SVG and PNG, without fonts of the system.
 
+use std::ops::Range;
 use std::path::Path;
 use std::sync::Once;
 
 use plotters::coord::Shift;
+use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
 
@@ -57,6 +59,8 @@ pub struct Panel {
     pub x: Scale,
     /// Vertical axis.
     pub y: Scale,
+    /// Limits; `None`: from the points. With limits on x the legend stands at the right, in the room left for it.
+    pub x_range: Option<(f64, f64)>,
     /// Limits; `None`: from the points.
     pub y_range: Option<(f64, f64)>,
     /// What is drawn.
@@ -95,7 +99,6 @@ const PALETTE: [RGBColor; 8] = [
 ];
 const INK: RGBColor = RGBColor(23, 32, 43);
 const GRID: RGBColor = RGBColor(222, 227, 233);
-const FAINT: RGBColor = RGBColor(241, 243, 246);
 const FONT: &str = "sans-serif";
 /// Pixels of a panel in the PNG; the SVG has half as many units.
 const PANEL: (u32, u32) = (1180, 900);
@@ -148,7 +151,8 @@ fn draw_panel<B: DrawingBackend>(
         .flat_map(|line| line.points.iter().map(|&(x, y)| (at(panel.x, x), at(panel.y, y))))
         .filter(|(x, y)| x.is_finite() && y.is_finite())
         .collect();
-    let (x_low, x_high) = span(points.iter().map(|p| p.0), panel.x, None);
+    let x_range = panel.x_range.map(|(a, b)| (at(panel.x, a), at(panel.x, b)));
+    let (x_low, x_high) = span(points.iter().map(|p| p.0), panel.x, x_range);
     let y_range = panel.y_range.map(|(a, b)| (at(panel.y, a), at(panel.y, b)));
     let (y_low, y_high) = span(points.iter().map(|p| p.1), panel.y, y_range);
     let style = |size: f64| (FONT, px(size)).into_font().color(&INK);
@@ -157,29 +161,19 @@ fn draw_panel<B: DrawingBackend>(
         .caption(&panel.title, style(19.0))
         .x_label_area_size(px(48.0))
         .y_label_area_size(px(72.0))
-        .build_cartesian_2d(x_low..x_high, y_low..y_high)?;
+        .build_cartesian_2d(Axis::new(panel.x, x_low, x_high), Axis::new(panel.y, y_low, y_high))?;
     let label = |scale: Scale| {
         move |x: &f64| match scale {
             Scale::Linear => trimmed(*x),
-            Scale::Log => {
-                // Labels at whole powers of ten; finer ticks of a short axis as plain numbers.
-                if (x - x.round()).abs() < 1e-6 { power(x.round() as i32) } else { trimmed(10f64.powf(*x)) }
-            }
+            Scale::Log => power(*x),
         }
     };
     let (x_text, y_text) = (label(panel.x), label(panel.y));
-    let count = |scale: Scale, low: f64, high: f64| match scale {
-        Scale::Linear => 7,
-        Scale::Log => ((high - low).ceil() as usize + 1).clamp(3, 9),
-    };
     chart
         .configure_mesh()
         .axis_style(ShapeStyle::from(&INK).stroke_width(zoom as u32))
         .bold_line_style(ShapeStyle::from(&GRID).stroke_width(zoom as u32))
-        .light_line_style(ShapeStyle::from(&FAINT).stroke_width(zoom as u32))
-        .max_light_lines(if panel.x == Scale::Linear && panel.y == Scale::Linear { 2 } else { 1 })
-        .x_labels(count(panel.x, x_low, x_high))
-        .y_labels(count(panel.y, y_low, y_high))
+        .light_line_style(TRANSPARENT)
         .x_label_formatter(&x_text)
         .y_label_formatter(&y_text)
         .x_desc(&panel.x_label)
@@ -222,7 +216,10 @@ fn draw_panel<B: DrawingBackend>(
     if panel.legend {
         chart
             .configure_series_labels()
-            .position(legend_place(&points, (x_low, x_high), (y_low, y_high)))
+            .position(match panel.x_range {
+                Some(_) => SeriesLabelPosition::MiddleRight,
+                None => legend_place(&points, (x_low, x_high), (y_low, y_high)),
+            })
             .margin(px(10.0))
             .legend_area_size(px(34.0))
             .background_style(WHITE.mix(0.86))
@@ -314,24 +311,70 @@ fn trimmed(x: f64) -> String {
     if text == "-0" { "0".into() } else { text.into() }
 }
 
-/// A power of ten with raised digits; small ones as they are.
-fn power(exponent: i32) -> String {
-    match exponent {
-        0 => "1".into(),
-        1 => "10".into(),
-        2 => "100".into(),
-        3 => "1000".into(),
-        -1 => "0.1".into(),
-        _ => {
-            let raised = |c: char| match c {
-                '-' => '⁻',
-                '1' => '¹',
-                '2' => '²',
-                '3' => '³',
-                digit => char::from_u32(0x2070 + digit as u32 - '0' as u32).unwrap_or(digit),
-            };
-            format!("10{}", exponent.to_string().chars().map(raised).collect::<String>())
+/// An axis in transformed coordinates with its own choice of numbers.
+#[derive(Clone, Debug)]
+struct Axis {
+    low: f64,
+    high: f64,
+    ticks: Vec<f64>,
+}
+
+impl Axis {
+    fn new(scale: Scale, low: f64, high: f64) -> Self {
+        Self { low, high, ticks: ticks(scale, low, high) }
+    }
+}
+
+impl Ranged for Axis {
+    type FormatOption = DefaultFormatting;
+    type ValueType = f64;
+
+    fn map(&self, value: &f64, limit: (i32, i32)) -> i32 {
+        let share = (value - self.low) / (self.high - self.low);
+        limit.0 + (share * f64::from(limit.1 - limit.0)).round() as i32
+    }
+
+    fn key_points<H: KeyPointHint>(&self, hint: H) -> Vec<f64> {
+        if hint.weight().allow_light_points() { Vec::new() } else { self.ticks.clone() }
+    }
+
+    fn range(&self) -> Range<f64> {
+        self.low..self.high
+    }
+}
+
+/// Where an axis has its numbers: seven or fewer round ones; whole powers of ten, or 1, 2, 5 of every decade if there are few.
+fn ticks(scale: Scale, low: f64, high: f64) -> Vec<f64> {
+    let inside = |x: &f64| (low - 1e-9..=high + 1e-9).contains(x);
+    match scale {
+        Scale::Linear => {
+            let rough = (high - low) / 7.0;
+            let decade = 10f64.powf(rough.log10().floor());
+            let step = [1.0, 2.0, 5.0, 10.0].map(|x| x * decade).into_iter().find(|s| *s >= rough);
+            let step = step.unwrap_or(rough);
+            let first = (low / step).ceil();
+            (0..20).map(|k| (first + f64::from(k)) * step).filter(inside).collect()
         }
+        Scale::Log => {
+            let (first, last) = (low.floor() as i32, high.ceil() as i32);
+            let decades = last - first;
+            let stride = (decades / 9 + 1) as usize;
+            let within: &[f64] = if high - low < 2.2 { &[1.0, 2.0, 5.0] } else { &[1.0] };
+            let all = (first..=last).step_by(stride);
+            all.flat_map(|e| within.iter().map(move |x| f64::from(e) + x.log10())).filter(inside).collect()
+        }
+    }
+}
+
+/// Ten to the power, short.
+fn power(exponent: f64) -> String {
+    let value = 10f64.powf(exponent);
+    if (-2.5..4.5).contains(&exponent) {
+        trimmed(value)
+    } else if (exponent - exponent.round()).abs() < 1e-6 {
+        format!("1e{}", exponent.round())
+    } else {
+        format!("{value:.0e}")
     }
 }
 
@@ -340,8 +383,19 @@ mod tests {
     use super::*;
 
     #[test]
+    fn axes_have_a_few_round_numbers() {
+        let near =
+            |a: Vec<f64>, b: &[f64]| a.len() == b.len() && a.iter().zip(b).all(|(x, y)| (x - y).abs() < 1e-9);
+        assert!(near(ticks(Scale::Linear, 0.0, 62.0), &[0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0]));
+        assert!(near(ticks(Scale::Log, -4.0, 0.0), &[-4.0, -3.0, -2.0, -1.0, 0.0]));
+        assert!(near(ticks(Scale::Log, -0.1, 1.1), &[0.0, 2f64.log10(), 5f64.log10(), 1.0]));
+        assert!(ticks(Scale::Log, -17.0, 3.0).len() <= 9);
+    }
+
+    #[test]
     fn labels() {
-        assert_eq!((power(-7), power(12), power(1)), ("10⁻⁷".into(), "10¹²".into(), "10".into()));
+        assert_eq!((power(-7.0), power(12.0), power(1.0)), ("1e-7".into(), "1e12".into(), "10".into()));
+        assert_eq!(power(0.5f64.log10()), "0.5");
         assert_eq!((trimmed(0.25), trimmed(-0.0), trimmed(120.0)), ("0.25".into(), "0".into(), "120".into()));
     }
 }

@@ -172,7 +172,6 @@ struct Stages {
     state: Vec<f64>,
     next: Vec<f64>,
     slopes: Vec<Vec<f64>>,
-    evaluations: usize,
 }
 
 impl Stages {
@@ -184,14 +183,12 @@ impl Stages {
             state: vec![0.0; order],
             next: vec![0.0; order],
             slopes: vec![vec![0.0; order]; count],
-            evaluations: 0,
         })
     }
 
     fn begin(&mut self, q: &[f64], v: &[f64]) {
         self.state[..q.len()].copy_from_slice(q);
         self.state[q.len()..].copy_from_slice(v);
-        self.evaluations = 0;
     }
 
     /// Slope of `next` into stage `k`.
@@ -201,7 +198,6 @@ impl Stages {
         let (rate, acceleration) = self.slopes[k].split_at_mut(n);
         rate.copy_from_slice(v);
         self.bodies.acceleration_into(q, v, acceleration);
-        self.evaluations += 1;
     }
 
     /// `next := state + h Σ weights slopes`.
@@ -344,16 +340,6 @@ impl Adaptive {
     /// Angles.
     pub fn q(&self) -> &[f64] {
         &self.stages.state[..self.stages.state.len() / 2]
-    }
-
-    /// Rates.
-    pub fn v(&self) -> &[f64] {
-        &self.stages.state[self.stages.state.len() / 2..]
-    }
-
-    /// Evaluations of the articulated bodies in the last run.
-    pub fn evaluations(&self) -> usize {
-        self.stages.evaluations
     }
 }
 
@@ -534,13 +520,13 @@ mod tests {
             let mut work = ClassicalRk4::new(&tree, 0.4 / steps as f64).unwrap();
             work.begin(&start.q, &start.v);
             (0..steps).for_each(|_| work.step());
-            off(work.q(), reference.q()).max(off(work.v(), reference.v()))
+            off(work.q(), reference.q())
         };
         let gauss = |steps: usize| {
             let mut work = GaussLegendre4::new(&tree, 0.4 / steps as f64).unwrap();
             work.begin(&start.q, &start.v);
             assert!((0..steps).all(|_| work.step()));
-            off(work.q(), reference.q()).max(off(work.v(), reference.v()))
+            off(work.q(), reference.q())
         };
         for (coarse, fine) in [(rk4(60), rk4(120)), (gauss(60), gauss(120))] {
             let order = (coarse / fine).log2();
@@ -561,7 +547,6 @@ mod tests {
                 work.run(&start.q, &start.v, 0.4).unwrap();
                 let error = off(work.q(), reference.q());
                 assert!(error < 1e2 * tolerance, "{pair:?} {tolerance:e}: {error:e}");
-                assert!(work.evaluations() > 0);
             }
         }
     }

@@ -1,7 +1,6 @@
 //! All integrators behind one face: from an initial condition to the end of a time span.
 
 use delmpc_mechanics::prelude::*;
-use delmpc_mechanics::velocity::VelocityWorkspace;
 
 use crate::Failure;
 use crate::hermite_simpson::{HermiteSimpson, Layout};
@@ -63,8 +62,6 @@ impl Method {
 pub struct Run {
     /// Angles, rad.
     pub q: Vec<f64>,
-    /// Rates, rad/s.
-    pub v: Vec<f64>,
     /// Wall time of the stepping, s.
     pub seconds: f64,
 }
@@ -81,7 +78,7 @@ pub fn run(
     duration: f64,
 ) -> Result<Run, Failure> {
     let steps = (duration / parameter).round() as usize;
-    let (seconds, q, v) = match method {
+    let (seconds, q) = match method {
         Method::Variational(s) => {
             let rule = LobattoRule::new(s)?;
             let mut integrator = Integrator::new(tree, &rule, parameter, StepOptions::default())?;
@@ -93,9 +90,7 @@ pub fn run(
             let (seconds, outcome) =
                 once(|| (0..steps).try_for_each(|_| integrator.step(tree, &mut state, &forces).map(|_| ())));
             outcome?;
-            let mut v = zero.clone();
-            VelocityWorkspace::new(tree).velocity_into(tree, &state, &mut v)?;
-            (seconds, state.q, v)
+            (seconds, state.q)
         }
         Method::HermiteSimpson | Method::HermiteSimpsonFull => {
             let layout = if method == Method::HermiteSimpson { Layout::Reduced } else { Layout::Full };
@@ -103,13 +98,13 @@ pub fn run(
             work.begin(&initial.q, &initial.v);
             let (seconds, outcome) = once(|| (0..steps).try_for_each(|_| work.step()));
             outcome?;
-            (seconds, work.q, work.v)
+            (seconds, work.q)
         }
         Method::Rk4 => {
             let mut work = ClassicalRk4::new(tree, parameter)?;
             work.begin(&initial.q, &initial.v);
             let (seconds, ()) = once(|| (0..steps).for_each(|_| work.step()));
-            (seconds, work.q().to_vec(), work.v().to_vec())
+            (seconds, work.q().to_vec())
         }
         Method::Gauss4 => {
             let mut work = GaussLegendre4::new(tree, parameter)?;
@@ -118,20 +113,49 @@ pub fn run(
             if !converged {
                 return Err(Failure::FixedPoint { time_step: parameter });
             }
-            (seconds, work.q().to_vec(), work.v().to_vec())
+            (seconds, work.q().to_vec())
         }
         Method::DormandPrince | Method::Fehlberg => {
             let pair = if method == Method::Fehlberg { Pair::Fehlberg78 } else { Pair::DormandPrince54 };
             let mut work = Adaptive::new(tree, pair, parameter)?;
             let (seconds, outcome) = once(|| work.run(&initial.q, &initial.v, duration));
             outcome?;
-            (seconds, work.q().to_vec(), work.v().to_vec())
+            (seconds, work.q().to_vec())
         }
     };
-    Ok(Run { q, v, seconds })
+    Ok(Run { q, seconds })
 }
 
 /// Largest absolute difference.
 pub fn distance(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).fold(0.0f64, |m, (x, y)| m.max((x - y).abs()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pendulum::{Links, initial_conditions, pendulum};
+
+    /// All methods come to the same end, each within its own error.
+    #[test]
+    fn all_methods_agree_with_the_integrator() {
+        let tree = pendulum(Links::Rods, 6).unwrap();
+        let initial = &initial_conditions(6, 1, 0.3, 2)[0];
+        let end = run(&tree, Method::Variational(6), 5e-3, initial, 0.5).unwrap().q;
+        for (method, parameter, error) in [
+            (Method::Variational(1), 5e-4, 1e-4),
+            (Method::Variational(2), 2e-3, 1e-7),
+            (Method::Variational(3), 5e-3, 1e-8),
+            (Method::HermiteSimpson, 2e-3, 1e-7),
+            (Method::HermiteSimpsonFull, 2e-3, 1e-7),
+            (Method::Rk4, 1e-3, 1e-7),
+            (Method::Gauss4, 2e-3, 1e-7),
+            (Method::DormandPrince, 1e-11, 1e-8),
+            (Method::Fehlberg, 1e-11, 1e-8),
+        ] {
+            let other = run(&tree, method, parameter, initial, 0.5).unwrap().q;
+            let apart = distance(&end, &other);
+            assert!(apart < error, "{}: {apart:e}", method.key());
+        }
+    }
 }
