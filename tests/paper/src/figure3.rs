@@ -186,12 +186,12 @@ pub fn run(campaign: &Campaign) -> Result<Part, Failure> {
     campaign.say("figure 3: reference");
     let samples = if campaign.quick { 2 } else { 100 };
     let problem = Problem::new(campaign, samples, 3, 1)?;
-    let levels = if campaign.quick { 3 } else { 5 };
+    let levels = if campaign.quick { 4 } else { 5 };
     let mut curves = Vec::new();
     for method in [Method::Variational(2), Method::HermiteSimpson, Method::HermiteSimpsonFull] {
         let mut points = Vec::new();
         let first = if campaign.quick { 0.0125 } else { 0.025 };
-        let steps = halvings(first, if method == Method::HermiteSimpsonFull { levels - 1 } else { levels });
+        let steps = halvings(first, if method == Method::HermiteSimpsonFull { levels - 2 } else { levels });
         for step in steps {
             campaign.say(&format!("figure 3: {}, {:.1} ms", method.key(), step * 1e3));
             points.push(problem.point(method, step)?);

@@ -62,7 +62,7 @@ impl Method {
 pub struct Run {
     /// Angles, rad.
     pub q: Vec<f64>,
-    /// Wall time of the stepping, s.
+    /// Time of the stepping, s.
     pub seconds: f64,
 }
 
