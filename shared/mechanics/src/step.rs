@@ -12,7 +12,7 @@
 //!
 //! **Iteration.** `J` is factorised at the start and kept while the iteration contracts (simplified Newton); Broyden's update
 //! on top of the factors costs a few scalar products and saves about one iteration. `J` is renewed when `θ` exceeds
-//! 0.1. A change is limited to
+//! 0.1. A change may be limited to
 //! [`StepOptions::change_limit`] in the largest angle, a trust region without a merit function: on a 32-link chain at steps of 40 ms
 //! (trapezoidal, random states, `tests/paper`) it raises the share of solved steps from 0.5 to 0.9.
 //!
@@ -74,8 +74,9 @@ pub struct StepOptions {
     pub max_iterations: usize,
     /// A revolute joint may end a step this far (rad) from where the guess put it; solutions beyond are refused as spurious.
     pub turn_limit: f64,
-    /// Largest change of a revolute joint in one iteration (rad): a longer change is shortened as a whole. Without effect while changes
-    /// are small; at steps so long that `J` is nearly singular on the way it is what brings the iteration home.
+    /// Largest change of a revolute joint in one iteration (rad): a longer change is shortened as a whole; infinite (the default): no
+    /// limit. Without effect while changes are small. 0.3 helps long chains at steps so long that `J` is nearly singular on the way;
+    /// a tree whose way to the root is longer than that may need more iterations with it than without.
     pub change_limit: f64,
     /// Room for forces outside the model.
     pub forces: ForceCapacity,
@@ -90,7 +91,7 @@ impl Default for StepOptions {
             variant: NewtonVariant::Broyden,
             max_iterations: 40,
             turn_limit: 1.0,
-            change_limit: 0.3,
+            change_limit: f64::INFINITY,
             forces: ForceCapacity::default(),
             dense_fallback: 128,
         }
@@ -456,6 +457,9 @@ impl Integrator {
 
     /// Shortens a change that turns a joint by more than the limit.
     fn limit_change(&mut self, tree: &KinematicTree) -> bool {
+        if self.options.change_limit.is_infinite() {
+            return false;
+        }
         let s = self.del.unknown_nodes();
         let mut turn = 0.0f64;
         for (body, spec) in tree.bodies().iter().enumerate().skip(tree.first_joint_body()) {

@@ -24,11 +24,12 @@ const LINKS: usize = 12;
 /// s; the second one carries the bars.
 const TIME_STEPS: [f64; 3] = [0.02, 0.01, 0.005];
 const BAR_STEP: f64 = 0.01;
-const METHODS: [Method; 7] = [
+const METHODS: [Method; 8] = [
     Method::Variational(1),
     Method::Variational(2),
     Method::Variational(3),
     Method::Variational(4),
+    Method::Variational(6),
     Method::HermiteSimpson,
     Method::Rk4,
     Method::Gauss4,
@@ -198,8 +199,12 @@ pub fn run(campaign: &Campaign) -> Result<Part, Failure> {
                         if k == 0 && time_step == BAR_STEP {
                             lines.push(Line {
                                 title: method.title(),
-                                style: if index < 4 { Style::Line } else { Style::Dashed },
-                                colour: [5, 0, 2, 3, 6, 1, 4][index],
+                                style: if matches!(method, Method::Variational(_)) {
+                                    Style::Line
+                                } else {
+                                    Style::Dashed
+                                },
+                                colour: [5, 0, 2, 3, 7, 6, 1, 4][index],
                                 points: envelope(&errors, time_step),
                             });
                         }
