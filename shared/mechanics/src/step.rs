@@ -12,7 +12,9 @@
 //!
 //! **Iteration.** `J` is factorised at the start and kept while the iteration contracts (simplified Newton); Broyden's update
 //! on top of the factors costs a few scalar products and saves about one iteration. `J` is renewed when `θ` exceeds
-//! 0.1.
+//! 0.1. A change may be limited to
+//! [`StepOptions::change_limit`] in the largest angle, a trust region without a merit function: on a 32-link chain at steps of 40 ms
+//! (trapezoidal, random states, `tests/paper`) it raises the share of solved steps from 0.5 to 0.9.
 //!
 //! **Stop.** On the change, never on the residual: its floor `~10 ε max|a^{αβ} Sᵀμ|` grows with the length of the chain. Done
 //! when the next change is predicted below [`StepOptions::accuracy`] times `1 + max|q|`, by default 1e-16: what is left of it accumulates in the momenta over many steps
@@ -73,6 +75,10 @@ pub struct StepOptions {
     pub accuracy: f64,
     /// A revolute joint may end a step this far (rad) from where the guess put it; solutions beyond are refused as spurious.
     pub turn_limit: f64,
+    /// Largest change of a revolute joint in one iteration (rad): a longer change is shortened as a whole; infinite (the default): no
+    /// limit. Without effect while changes are small. 0.3 helps long chains at steps so long that `J` is nearly singular on the way;
+    /// a tree whose way to the root is longer than that may need more iterations with it than without.
+    pub change_limit: f64,
     /// Room for forces outside the model.
     pub forces: ForceCapacity,
     /// Coordinates times nodes up to which a dense LU stands by for states where a leaf-to-root pivot is singular.
@@ -87,6 +93,7 @@ impl Default for StepOptions {
             max_iterations: 40,
             accuracy: 1e-16,
             turn_limit: 1.0,
+            change_limit: f64::INFINITY,
             forces: ForceCapacity::default(),
             dense_fallback: 128,
         }
@@ -147,6 +154,8 @@ pub struct Integrator {
     /// Where the guess put node s.
     guessed_end: Vec<f64>,
     changes: Vec<f64>,
+    /// Their squares.
+    squares: [f64; BROYDEN_MEMORY],
 }
 
 impl Integrator {
@@ -188,6 +197,7 @@ impl Integrator {
             has_previous: false,
             guessed_end: vec![0.0; tree.dof()],
             changes: vec![0.0; BROYDEN_MEMORY * order],
+            squares: [0.0; BROYDEN_MEMORY],
             del,
         })
     }
@@ -417,6 +427,7 @@ impl Integrator {
                 self.broyden(order, &mut remembered);
             }
             report.iterations += 1;
+            let limited = self.limit_change(tree);
             let mut size = 1.0f64;
             let mut change = 0.0f64;
             for dof in 0..tree.dof() {
@@ -440,19 +451,42 @@ impl Integrator {
                 self.del.evaluate(tree, forces.laws);
                 return Ok(());
             }
-            fresh = contraction < RENEW_CONTRACTION || iteration == 0;
+            fresh = !limited && (contraction < RENEW_CONTRACTION || iteration == 0);
             last_change = change;
         }
         Err(StepError::NotConverged { residual, change: last_change, iterations: report.iterations })
     }
 
+    /// Shortens a change that turns a joint by more than the limit.
+    fn limit_change(&mut self, tree: &KinematicTree) -> bool {
+        if self.options.change_limit.is_infinite() {
+            return false;
+        }
+        let s = self.del.unknown_nodes();
+        let mut turn = 0.0f64;
+        for (body, spec) in tree.bodies().iter().enumerate().skip(tree.first_joint_body()) {
+            if spec.joint.kind == JointKind::Revolute {
+                let dof = tree.joint_dof(body);
+                for delta in &self.direction[dof * s..(dof + 1) * s] {
+                    turn = turn.max(delta.abs());
+                }
+            }
+        }
+        let limited = turn > self.options.change_limit;
+        if limited {
+            let scale = self.options.change_limit / turn;
+            for x in &mut self.direction {
+                *x *= scale;
+            }
+        }
+        limited
+    }
+
     /// Broyden's method on top of the factors: turns `-J_0⁻¹ r` into the quasi-Newton change, and remembers it.
     fn broyden(&mut self, order: usize, remembered: &mut usize) {
-        let square = |x: &[f64]| x.iter().map(|v| v * v).sum::<f64>();
         for j in 0..*remembered {
             let own = &self.changes[j * order..(j + 1) * order];
-            let inner: f64 = own.iter().zip(&self.direction).map(|(a, b)| a * b).sum();
-            let factor = inner / square(own);
+            let factor = inner_product(own, &self.direction) / self.squares[j];
             if j + 1 < *remembered {
                 let next = &self.changes[(j + 1) * order..(j + 2) * order];
                 for (x, n) in self.direction.iter_mut().zip(next) {
@@ -470,6 +504,7 @@ impl Integrator {
         }
         if *remembered < BROYDEN_MEMORY {
             self.changes[*remembered * order..(*remembered + 1) * order].copy_from_slice(&self.direction);
+            self.squares[*remembered] = inner_product(&self.direction, &self.direction);
             *remembered += 1;
         }
     }
@@ -511,6 +546,19 @@ impl Integrator {
         self.has_previous = true;
         Ok(report)
     }
+}
+
+/// Scalar product in four partial sums: additions need not wait for each other.
+fn inner_product(a: &[f64], b: &[f64]) -> f64 {
+    let mut sums = [0.0f64; 4];
+    let (whole, other) = (a.chunks_exact(4), b.chunks_exact(4));
+    let rest: f64 = whole.remainder().iter().zip(other.remainder()).map(|(x, y)| x * y).sum();
+    for (x, y) in whole.zip(other) {
+        for k in 0..4 {
+            sums[k] += x[k] * y[k];
+        }
+    }
+    rest + (sums[0] + sums[1]) + (sums[2] + sums[3])
 }
 
 #[cfg(test)]

@@ -1,0 +1,161 @@
+//! All integrators behind one face: from an initial condition to the end of a time span.
+
+use delmpc_mechanics::prelude::*;
+
+use crate::Failure;
+use crate::hermite_simpson::{HermiteSimpson, Layout};
+use crate::pendulum::Initial;
+use crate::runge_kutta::{Adaptive, ClassicalRk4, GaussLegendre4, Pair};
+use crate::stopwatch::once;
+
+/// An integrator.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Method {
+    /// The variational integrator with `s` unknown nodes.
+    Variational(usize),
+    /// Hermite-Simpson collocation, reduced to accelerations.
+    HermiteSimpson,
+    /// Hermite-Simpson collocation, all unknowns kept.
+    HermiteSimpsonFull,
+    /// Classical Runge-Kutta.
+    Rk4,
+    /// Gauss-Legendre of order 4.
+    Gauss4,
+    /// Dormand-Prince 5(4), adaptive.
+    DormandPrince,
+    /// Runge-Kutta-Fehlberg 7(8), adaptive.
+    Fehlberg,
+}
+
+impl Method {
+    /// Name in files.
+    pub fn key(self) -> String {
+        match self {
+            Self::Variational(s) => format!("variational_s{s}"),
+            Self::HermiteSimpson => "hermite_simpson".into(),
+            Self::HermiteSimpsonFull => "hermite_simpson_full".into(),
+            Self::Rk4 => "rk4".into(),
+            Self::Gauss4 => "gauss_legendre_4".into(),
+            Self::DormandPrince => "dormand_prince_54".into(),
+            Self::Fehlberg => "fehlberg_78".into(),
+        }
+    }
+
+    /// Name in plots.
+    pub fn title(self) -> String {
+        match self {
+            Self::Variational(1) => "trapezoidal (s = 1)".into(),
+            Self::Variational(2) => "Simpson (s = 2)".into(),
+            Self::Variational(s) => format!("s = {s}"),
+            Self::HermiteSimpson => "Hermite-Simpson, reduced".into(),
+            Self::HermiteSimpsonFull => "Hermite-Simpson, full".into(),
+            Self::Rk4 => "RK4".into(),
+            Self::Gauss4 => "Gauss-Legendre 4".into(),
+            Self::DormandPrince => "Dormand-Prince 5(4)".into(),
+            Self::Fehlberg => "Fehlberg 7(8)".into(),
+        }
+    }
+}
+
+/// The end of a run.
+#[derive(Clone, Debug)]
+pub struct Run {
+    /// Angles, rad.
+    pub q: Vec<f64>,
+    /// Time of the stepping, s.
+    pub seconds: f64,
+}
+
+/// Runs from `initial` over `duration` (s); `parameter` is the time step (s) or, for adaptive methods, the tolerance.
+///
+/// # Errors
+/// A step that fails.
+pub fn run(
+    tree: &KinematicTree,
+    method: Method,
+    parameter: f64,
+    initial: &Initial,
+    duration: f64,
+) -> Result<Run, Failure> {
+    let steps = (duration / parameter).round() as usize;
+    let (seconds, q) = match method {
+        Method::Variational(s) => {
+            let rule = LobattoRule::new(s)?;
+            let mut integrator = Integrator::new(tree, &rule, parameter, StepOptions::default())?;
+            let mut state = State::zeros(tree);
+            state.q.copy_from_slice(&initial.q);
+            integrator.velocities().set_velocity(tree, &mut state, &initial.v)?;
+            let zero = vec![0.0; tree.dof()];
+            let forces = StepForces::held(&zero);
+            let (seconds, outcome) =
+                once(|| (0..steps).try_for_each(|_| integrator.step(tree, &mut state, &forces).map(|_| ())));
+            outcome?;
+            (seconds, state.q)
+        }
+        Method::HermiteSimpson | Method::HermiteSimpsonFull => {
+            let layout = if method == Method::HermiteSimpson { Layout::Reduced } else { Layout::Full };
+            let mut work = HermiteSimpson::new(tree, parameter, layout)?;
+            work.begin(&initial.q, &initial.v);
+            let (seconds, outcome) = once(|| (0..steps).try_for_each(|_| work.step()));
+            outcome?;
+            (seconds, work.q)
+        }
+        Method::Rk4 => {
+            let mut work = ClassicalRk4::new(tree, parameter)?;
+            work.begin(&initial.q, &initial.v);
+            let (seconds, ()) = once(|| (0..steps).for_each(|_| work.step()));
+            (seconds, work.q().to_vec())
+        }
+        Method::Gauss4 => {
+            let mut work = GaussLegendre4::new(tree, parameter)?;
+            work.begin(&initial.q, &initial.v);
+            let (seconds, converged) = once(|| (0..steps).fold(true, |all, _| work.step() && all));
+            if !converged {
+                return Err(Failure::FixedPoint { time_step: parameter });
+            }
+            (seconds, work.q().to_vec())
+        }
+        Method::DormandPrince | Method::Fehlberg => {
+            let pair = if method == Method::Fehlberg { Pair::Fehlberg78 } else { Pair::DormandPrince54 };
+            let mut work = Adaptive::new(tree, pair, parameter)?;
+            let (seconds, outcome) = once(|| work.run(&initial.q, &initial.v, duration));
+            outcome?;
+            (seconds, work.q().to_vec())
+        }
+    };
+    Ok(Run { q, seconds })
+}
+
+/// Largest absolute difference.
+pub fn distance(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).fold(0.0f64, |m, (x, y)| m.max((x - y).abs()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pendulum::{Links, initial_conditions, pendulum};
+
+    /// All methods come to the same end, each within its own error.
+    #[test]
+    fn all_methods_agree_with_the_integrator() {
+        let tree = pendulum(Links::Rods, 6).unwrap();
+        let initial = &initial_conditions(6, 1, 0.3, 2)[0];
+        let end = run(&tree, Method::Variational(6), 5e-3, initial, 0.5).unwrap().q;
+        for (method, parameter, error) in [
+            (Method::Variational(1), 5e-4, 1e-4),
+            (Method::Variational(2), 2e-3, 1e-7),
+            (Method::Variational(3), 5e-3, 1e-8),
+            (Method::HermiteSimpson, 2e-3, 1e-7),
+            (Method::HermiteSimpsonFull, 2e-3, 1e-7),
+            (Method::Rk4, 1e-3, 1e-7),
+            (Method::Gauss4, 2e-3, 1e-7),
+            (Method::DormandPrince, 1e-11, 1e-8),
+            (Method::Fehlberg, 1e-11, 1e-8),
+        ] {
+            let other = run(&tree, method, parameter, initial, 0.5).unwrap().q;
+            let apart = distance(&end, &other);
+            assert!(apart < error, "{}: {apart:e}", method.key());
+        }
+    }
+}
