@@ -115,6 +115,7 @@ fn optimality(core: &core::Controller, multipliers: &[(RowId, f64)]) -> f64 {
             })
             .collect();
     }
+    let largest = multipliers.iter().fold(f64::MIN_POSITIVE, |m, (_, multiplier)| m.max(*multiplier));
     for &(row, multiplier) in multipliers {
         coefficients.fill(0.0);
         problem.add_row(row, 1.0, &mut coefficients);
@@ -124,11 +125,11 @@ fn optimality(core: &core::Controller, multipliers: &[(RowId, f64)]) -> f64 {
         let value = if k < stages { dot(by_input, plan.u(k)) } else { 0.0 } + dot(by_state, plan.x(k));
         let (tag, violation) = (problem.tag(row), value - problem.bound(row));
         assert!(multiplier >= 0.0 && multiplier <= tag.penalty * (1.0 + 1e-9), "{tag:?}: {multiplier}");
-        let gives_way = multiplier >= tag.penalty * (1.0 - 1e-9);
-        let broken = if gives_way { (-violation).max(0.0) } else { violation.abs() };
-        if multiplier > 0.0 {
-            worst = worst.max(broken / tag.scale);
-        }
+        // Broken and not paid for, or paid for and not broken: the less of the two, each relative to its size.
+        let relative = violation.abs() / tag.scale;
+        let most = if tag.penalty.is_finite() { tag.penalty } else { largest };
+        let unpaid = if violation > 0.0 { (tag.penalty - multiplier) / most } else { multiplier / most };
+        worst = worst.max(relative.min(unpaid));
     }
     worst
 }
@@ -158,7 +159,8 @@ fn compare(cycles: usize, stride: usize) -> Findings {
         let multipliers: Vec<(RowId, f64)> =
             core.constrained().multipliers().filter(|(_, multiplier)| *multiplier > 0.0).collect();
         findings.cycles += 1;
-        findings.worst_optimality = findings.worst_optimality.max(optimality(core, &multipliers));
+        let optimality = optimality(core, &multipliers);
+        findings.worst_optimality = findings.worst_optimality.max(optimality);
         let mut other = plan.clone();
         if multipliers.is_empty() {
             let riccati = riccati.get_or_insert_with(|| Riccati::new(problem.size()));
@@ -171,7 +173,14 @@ fn compare(cycles: usize, stride: usize) -> Findings {
             findings.most_active_rows = findings.most_active_rows.max(multipliers.len());
         }
         solve_sparse(problem, &mut other, 1e-10).unwrap();
-        findings.worst_difference = findings.worst_difference.max(difference(torque, plan, &other));
+        let difference = difference(torque, plan, &other);
+        findings.worst_difference = findings.worst_difference.max(difference);
+        if optimality > 1e-6 || difference > 1e-6 {
+            println!(
+                "cycle {cycle}, {} active rows: difference {difference:.1e}, optimality {optimality:.1e}",
+                multipliers.len()
+            );
+        }
     });
     println!("{findings:?}");
     findings

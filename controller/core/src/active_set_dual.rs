@@ -129,13 +129,29 @@ impl ActiveSetDual {
         y: &mut [f64],
         limit: u32,
     ) -> Result<Option<DualReport>, QpError> {
+        self.settle_near(gram, slack, upper, y, 0.0, limit)
+    }
+
+    /// The same where multipliers within `near` of a bound count as on it.
+    ///
+    /// # Errors
+    /// As [`QpSolver::solve`].
+    pub fn settle_near(
+        &mut self,
+        gram: MatRef<'_, f64>,
+        slack: &[f64],
+        upper: &[f64],
+        y: &mut [f64],
+        near: f64,
+        limit: u32,
+    ) -> Result<Option<DualReport>, QpError> {
         check_data(self.capacity(), gram, slack, upper)?;
         self.start.clear();
         self.start.extend_from_slice(y);
         for (side, (y, upper)) in self.sides.iter_mut().zip(y.iter().zip(upper)) {
             *side = match *y {
-                y if y <= 0.0 => Side::Zero,
-                y if y >= *upper => Side::Upper,
+                y if y <= near => Side::Zero,
+                y if y >= *upper - near => Side::Upper,
                 _ => Side::Free,
             };
         }

@@ -34,7 +34,8 @@
 //!
 //! **Solving (D).** From one cycle to the next the set of active rows hardly changes. So a few partitions of block pivoting
 //! ([`crate::active_set_dual`]) are tried from the last multipliers: one small Cholesky factorisation each, and where the signs
-//! are right the answer is the optimum to round-off. If it does not settle, the interior-point backend solves it.
+//! are right the answer is the optimum to round-off. If it does not settle, the interior-point backend solves it, and its answer is
+//! polished in the same way.
 //!
 //! Rows and `G G'` depend on the linearisation only, the slacks `h` on `x_0` too: sweeping the rows belongs to the preparation.
 //!
@@ -49,7 +50,7 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
-use faer::{Accum, Mat, Par};
+use faer::{Accum, Mat, MatRef, Par};
 
 use crate::active_set_dual::ActiveSetDual;
 use crate::dual_qp::QpSolver;
@@ -58,6 +59,11 @@ use crate::kernels::{gemm, gemv};
 use crate::lq_problem::{LqProblem, LqSize, RowId, RowTag};
 use crate::riccati::Riccati;
 use crate::trajectory::Trajectory;
+
+/// Multipliers this near to a bound, relative to the largest, are taken to be on it when an interior-point answer is polished.
+const NEARLY: f64 = 1e-6;
+/// Partitions of that.
+const POLISHING_PARTITIONS: u32 = 6;
 
 /// How the row generation proceeds.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -76,7 +82,7 @@ pub struct ProjectedQpOptions {
 
 impl Default for ProjectedQpOptions {
     fn default() -> Self {
-        Self { capacity: 64, rows_per_round: 24, max_rounds: 8, tolerance: 1e-6, pivots: 12 }
+        Self { capacity: 64, rows_per_round: 24, max_rounds: 8, tolerance: 1e-8, pivots: 12 }
     }
 }
 
@@ -211,6 +217,7 @@ impl ProjectedQp {
         }
         self.find_violated(problem, trajectory, &mut report);
         if report.worst.is_none() {
+            self.rows.clear();
             return Ok(report);
         }
         self.lqr.copy_from(trajectory);
@@ -422,7 +429,12 @@ impl ProjectedQp {
         }
         report.backend_solves += 1;
         match backend.solve(gram, slack, upper, y) {
-            Ok(dual) => report.iterations += dual.iterations,
+            Ok(dual) => {
+                report.iterations += dual.iterations;
+                if self.options.pivots > 0 {
+                    report.iterations += polish(&mut self.pivoting, gram, slack, upper, y);
+                }
+            }
             Err(_) => {
                 report.backend_failures += 1;
                 match self.pivoting.solve(gram, slack, upper, y) {
@@ -453,6 +465,22 @@ impl ProjectedQp {
             v.copy_from_slice(&self.w[k * inputs..(k + 1) * inputs]);
             riccati.solve_input_factor_transposed(k, v);
         }
+    }
+}
+
+/// Takes an interior-point answer to round-off: sides from where its multipliers nearly are, then a few partitions. Leaves the answer
+/// as it is when they do not settle; returns the partitions.
+fn polish(
+    pivoting: &mut ActiveSetDual,
+    gram: MatRef<'_, f64>,
+    slack: &[f64],
+    upper: &[f64],
+    y: &mut [f64],
+) -> u32 {
+    let near = NEARLY * crate::kernels::largest(y);
+    match pivoting.settle_near(gram, slack, upper, y, near, POLISHING_PARTITIONS) {
+        Ok(Some(dual)) => dual.iterations,
+        _ => 0,
     }
 }
 

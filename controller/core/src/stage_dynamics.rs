@@ -26,7 +26,7 @@ use crate::lq_problem::LqStage;
 const UNKNOWN_NODES: usize = 2;
 
 /// To what a step is solved, rad or m: far below what encoders tell.
-const ACCURACY: f64 = 1e-12;
+const ACCURACY: f64 = 1e-9;
 
 /// Integrator and linearisation for stages of any length.
 #[derive(Clone, Debug)]
