@@ -211,8 +211,7 @@ impl Linearizer {
         if self.coordinates == StateCoordinates::Velocity {
             self.evaluate_velocities(tree, integrator)?;
         }
-        let (del, solver) = integrator.del_and_solver();
-        solver.factor(tree, del)?;
+        let (del, solver) = integrator.factor_solution(tree)?;
         if solver.hessian().is_none() {
             self.hessian.evaluate(tree, del);
         }
@@ -333,8 +332,7 @@ impl Linearizer {
             let reason = "the tangent path gives momentum coordinates";
             return Err(ModelError::Unsupported { body: 0, reason }.into());
         }
-        let (del, solver) = integrator.del_and_solver();
-        solver.factor(tree, del)?;
+        let (del, solver) = integrator.factor_solution(tree)?;
         let n = tree.dof();
         for column in 0..self.step.matrix.columns() {
             self.tangent_column(tree, del, solver, column, n);
@@ -452,8 +450,7 @@ impl Linearizer {
                 return Err(ModelError::Length { quantity, got, expected }.into());
             }
         }
-        let (del, solver) = integrator.del_and_solver();
-        solver.factor(tree, del)?;
+        let (del, solver) = integrator.factor_solution(tree)?;
         if solver.hessian().is_none() {
             self.hessian.evaluate(tree, del);
         }
