@@ -519,12 +519,17 @@ impl DelWorkspace {
         total
     }
 
-    /// `S^αᵀ X` of the floating base.
-    pub(crate) fn project_base(&self, alpha: usize, wrench: &Wrench) -> [f64; 6] {
+    /// `Z^α` and the mass centre `p^α` of the floating base.
+    pub(crate) fn base_turn_and_position(&self, alpha: usize) -> (Matrix3<f64>, Vector3<f64>) {
         let base = &self.base[alpha / LANES];
         let lane = alpha % LANES;
         let z = Matrix3::from_fn(|r, c| base.z[3 * r + c].0[lane]);
-        let position = Vector3::from_fn(|r, _| base.position[r].0[lane]);
+        (z, Vector3::from_fn(|r, _| base.position[r].0[lane]))
+    }
+
+    /// `S^αᵀ X` of the floating base.
+    pub(crate) fn project_base(&self, alpha: usize, wrench: &Wrench) -> [f64; 6] {
+        let (z, position) = self.base_turn_and_position(alpha);
         let upper = z.tr_mul(&(wrench.torque - position.cross(&wrench.force)));
         let lower = self.center.rotation.tr_mul(&wrench.force);
         [upper.x, upper.y, upper.z, lower.x, lower.y, lower.z]

@@ -149,7 +149,7 @@ impl DenseNewton {
             }
         }
         if base > 0 {
-            jacobian_column_rule(tree, del, &self.hessian, &mut |row, column, change| match change {
+            jacobian_column_rule(tree, del, &self.hessian, |row, column, change| match change {
                 crate::newton_direction::BaseEntry::Set(value) => entries[row * order + column] = value,
                 crate::newton_direction::BaseEntry::Add(value) => entries[row * order + column] += value,
             });

@@ -134,7 +134,7 @@ pub(crate) fn jacobian_column_rule(
     tree: &KinematicTree,
     del: &DelWorkspace,
     hessian: &DelHessian,
-    put: &mut dyn FnMut(usize, usize, BaseEntry),
+    mut put: impl FnMut(usize, usize, BaseEntry),
 ) {
     let s = del.unknown_nodes();
     let start_twists = base_matrix(del, 0);
@@ -164,9 +164,11 @@ pub(crate) fn jacobian_column_rule(
 
     // Change of the total impulse by δξ^s through the rigid shift S^0 δξ^s and through δξ^0 = -δξ^s.
     let mut shifted_impulse = Matrix6::from_fn(|r, k| -hessian.impulse_column(k, 0)[r]);
+    let mut rigid = Matrix6::zeros();
     for alpha in 0..=s {
-        shifted_impulse += base_gain(del, hessian, alpha) * start_twists;
+        rigid += Matrix6::from_fn(|r, k| hessian.rigid_column(k, alpha)[r]);
     }
+    shifted_impulse += rigid * start_twists;
     let momentum_end = {
         let (_, impulse) = del.body_momentum_and_impulse(0, s);
         del.base_momentum_before_end() + impulse
@@ -205,13 +207,12 @@ pub(crate) fn jacobian_column_rule(
 
 /// `S^α` of the base as a matrix.
 pub(crate) fn base_matrix(del: &DelWorkspace, alpha: usize) -> Matrix6<f64> {
-    // Sᵀ applied to unit wrenches gives its columns' entries row by row.
-    let mut rows = Matrix6::zeros();
-    for r in 0..6 {
-        let unit = Wrench::from_vector(&Vector6::ith(r, 1.0));
-        rows.set_row(r, &Vector6::from(del.project_base(alpha, &unit)).transpose());
-    }
-    rows
+    let (z, p) = del.base_turn_and_position(alpha);
+    let mut twists = Matrix6::zeros();
+    twists.fixed_view_mut::<3, 3>(0, 0).copy_from(&z);
+    twists.fixed_view_mut::<3, 3>(3, 0).copy_from(&(p.cross_matrix() * z));
+    twists.fixed_view_mut::<3, 3>(3, 3).copy_from(&del.center.rotation);
+    twists
 }
 
 /// Matrix of `ad^D_X`.
@@ -221,16 +222,6 @@ fn dual_matrix(x: &Wrench) -> Matrix6<f64> {
         m.set_column(c, &x.dual_bracket(&Twist::from_vector(&Vector6::ith(c, 1.0))).to_vector());
     }
     m
-}
-
-/// `(𝒴 - ad^D_Γ)^α` of the base, times `w_α Δt`.
-fn base_gain(del: &DelWorkspace, hessian: &DelHessian, alpha: usize) -> Matrix6<f64> {
-    // The shift rows hold Sᵀ𝒴 of the base: solve for 𝒴 by the inverse of Sᵀ.
-    let rows = Matrix6::from_fn(|k, c| hessian.shift_row(k, alpha)[c]);
-    let (_, impulse) = del.body_momentum_and_impulse(0, alpha);
-    let twists = base_matrix(del, alpha);
-    let gain = twists.transpose().lu().solve(&rows).unwrap_or_else(Matrix6::zeros);
-    gain - dual_matrix(&impulse)
 }
 
 /// `N^α(X)` of the base as a matrix.
