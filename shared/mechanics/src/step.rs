@@ -471,9 +471,8 @@ impl Integrator {
         let direction = &mut self.direction;
         let turn = Vector3::from_fn(|k, _| direction[k * s + s - 1]);
         for (alpha, factored) in self.factored_travel.iter().enumerate() {
-            let travel = Vector3::from_fn(|k, _| {
-                self.del.node(alpha + 1, 3 + k) + direction[(3 + k) * s + alpha]
-            });
+            let travel =
+                Vector3::from_fn(|k, _| self.del.node(alpha + 1, 3 + k) + direction[(3 + k) * s + alpha]);
             let bend = turn.cross(&(factored - travel));
             for k in 0..3 {
                 direction[(3 + k) * s + alpha] += bend[k];
@@ -492,7 +491,7 @@ impl Integrator {
         for (dof, end) in self.guessed_end.iter_mut().enumerate() {
             *end = self.del.node(s, dof);
         }
-        let mut last_change = f64::INFINITY;
+        let (mut last_change, mut last_contraction) = (f64::INFINITY, 0.0f64);
         let mut remembered = 0;
         let mut contracts = self.factored;
         let (old_factors, mut renewed) = (self.factored, false);
@@ -538,10 +537,13 @@ impl Integrator {
                 return Err(StepError::NotConverged { residual, change, iterations: report.iterations });
             }
             let contraction = change / last_change;
-            let predicted = change * contraction;
-            if change <= SMALL_CHANGE.max(self.options.accuracy) * size
-                || (iteration > 0 && predicted <= self.options.accuracy * size)
-                || (change < STAGNATION_CHANGE * size && contraction > 0.5)
+            // Old factors contract unevenly: the worse of two contractions counts, and a poor one is no sign of round-off.
+            let old = old_factors && !renewed;
+            let rate = if old { contraction.max(last_contraction) } else { contraction };
+            let small = if old { self.options.accuracy } else { SMALL_CHANGE.max(self.options.accuracy) };
+            if change <= small * size
+                || (iteration > 0 && change * rate <= self.options.accuracy * size)
+                || (!old && change < STAGNATION_CHANGE * size && contraction > 0.5)
             {
                 self.del.evaluate(tree, forces.laws);
                 if !old_factors {
@@ -554,7 +556,7 @@ impl Integrator {
                 return Ok(());
             }
             contracts = contraction < RENEW_CONTRACTION || iteration == 0;
-            last_change = change;
+            (last_change, last_contraction) = (change, contraction);
         }
         Err(StepError::NotConverged { residual, change: last_change, iterations: report.iterations })
     }
