@@ -569,11 +569,7 @@ fn subtract_block<S: Simd, const N: usize>(
 }
 
 #[inline(always)]
-fn total<S: Simd, const N: usize>(
-    simd: S,
-    sums: &[[WideLane<S>; N]; N],
-    s: usize,
-) -> [WideLane<S>; N] {
+fn total<S: Simd, const N: usize>(simd: S, sums: &[[WideLane<S>; N]; N], s: usize) -> [WideLane<S>; N] {
     let one = WideLane::splat(simd, 1.0);
     let mut out = sums[0];
     for k in 1..s {
@@ -646,9 +642,11 @@ impl Kernel for SolveOne<'_> {
         match (forward, lu.s) {
             (true, 1) => forward_one(tree, lu, rhs, 1),
             (true, 2) => forward_one(tree, lu, rhs, 2),
+            (true, 3) => forward_one(tree, lu, rhs, 3),
             (true, s) => forward_one(tree, lu, rhs, s),
             (false, 1) => backward_one(tree, lu, rhs, 1),
             (false, 2) => backward_one(tree, lu, rhs, 2),
+            (false, 3) => backward_one(tree, lu, rhs, 3),
             (false, s) => backward_one(tree, lu, rhs, s),
         }
     }

@@ -37,7 +37,7 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use crate::del_residual::{DelWorkspace, load_arm};
-use crate::floating_base::{BaseLanes, second_order, second_order_rate};
+use crate::floating_base::{BaseLanes, base_project, second_order, second_order_rate};
 use crate::gravity_hessian::gravity_column;
 use crate::kinetic_hessian::{CompositeLanes, composite_times, kinetic_columns, own_inertia};
 use crate::lanes::{
@@ -124,6 +124,9 @@ pub struct DelHessian {
     impulse_columns: Vec<[Quad; 6]>,
     /// Columns of `(𝒴 - ad^D_Γ) w_α Δt` of the base, the change of the total impulse by a rigid shift at node α (lanes): `[k groups + g]`.
     rigid_columns: Vec<[Quad; 6]>,
+    /// `S^0ᵀ` of the shift rows, lanes over α, and `S^sᵀ` of the impulse columns, lanes over γ: `[dof groups + g]`.
+    shifts_on_base: Vec<[Quad; 6]>,
+    impulses_on_base: Vec<[Quad; 6]>,
 }
 
 impl DelHessian {
@@ -161,6 +164,8 @@ impl DelHessian {
             shift_rows: vec![[Quad::ZERO; 6]; if floating { tree.dof() * groups } else { 0 }],
             impulse_columns: vec![[Quad::ZERO; 6]; if floating { tree.dof() * groups } else { 0 }],
             rigid_columns: vec![[Quad::ZERO; 6]; if floating { 6 * groups } else { 0 }],
+            shifts_on_base: vec![[Quad::ZERO; 6]; if floating { tree.dof() * groups } else { 0 }],
+            impulses_on_base: vec![[Quad::ZERO; 6]; if floating { tree.dof() * groups } else { 0 }],
         }
     }
 
@@ -232,6 +237,18 @@ impl DelHessian {
     #[inline]
     pub(crate) fn impulse_column(&self, dof: usize, gamma: usize) -> [f64; 6] {
         self.impulse_columns[dof * self.groups + gamma / LANES].map(|q| q.0[gamma % LANES])
+    }
+
+    /// `S^0ᵀ` of [`DelHessian::shift_row`], component `k`.
+    #[inline(always)]
+    pub(crate) fn shift_on_base(&self, dof: usize, k: usize, alpha: usize) -> f64 {
+        self.shifts_on_base[dof * self.groups + alpha / LANES][k].0[alpha % LANES]
+    }
+
+    /// `S^sᵀ` of [`DelHessian::impulse_column`], component `k`.
+    #[inline(always)]
+    pub(crate) fn impulse_on_base(&self, dof: usize, k: usize, gamma: usize) -> f64 {
+        self.impulses_on_base[dof * self.groups + gamma / LANES][k].0[gamma % LANES]
     }
 
     /// `(𝒴 - ad^D_Γ)^α e_k` of the base, times `w_α Δt`.
@@ -327,6 +344,25 @@ impl Kernel for BasePairs<'_> {
                 impulse_by_rate(simd, tree, del, hessian, i);
             }
         }
+        project_on_base(simd, del, hessian);
+    }
+}
+
+/// `S^0ᵀ` of the shift rows and `S^sᵀ` of the impulse columns.
+#[inline(always)]
+fn project_on_base<S: Simd>(simd: S, del: &DelWorkspace, hessian: &mut DelHessian) {
+    let s = hessian.s;
+    let [start, end] = [0, s].map(|alpha| {
+        let base = &del.base[alpha / LANES];
+        let spread = |quad: &Quad| Quad::splat(quad.0[alpha % LANES]);
+        let (z, position) = (base.z.each_ref().map(spread), base.position.each_ref().map(spread));
+        BaseLanes { z, position, ..*base }
+    });
+    for (shift, on_base) in hessian.shift_rows.iter().zip(&mut hessian.shifts_on_base) {
+        *on_base = store(base_project(simd, &start, load(simd, shift)));
+    }
+    for (impulse, on_base) in hessian.impulse_columns.iter().zip(&mut hessian.impulses_on_base) {
+        *on_base = store(base_project(simd, &end, load(simd, impulse)));
     }
 }
 
@@ -745,8 +781,10 @@ fn base_pairs<S: Simd>(
             let (twist, rate): (Lane6<S>, Lane6<S>) = (load(simd, &column.twist), load(simd, &column.rate));
             carried[g][l] = store(composite_times(simd, mass, &hessian.composites[g], twist));
             carried_rates[g][l] = store(composite_times(simd, mass, &hessian.composites[g], rate));
-            let mut force =
-                add(dual_bracket(momentum, rate), fixed_direction_gain(simd, tree, del, hessian, 0, g, twist));
+            let mut force = add(
+                dual_bracket(momentum, rate),
+                fixed_direction_gain(simd, tree, del, hessian, 0, g, twist),
+            );
             if let Some(general) = hessian.general.get(g) {
                 force = add(force, matrix_times(simd, &general.nu, rate));
                 force = add(force, matrix_times(simd, &general.eta, twist));
@@ -765,8 +803,7 @@ fn base_pairs<S: Simd>(
                 let twist: Lane6<S> = load(simd, &hessian.columns[l * groups + g].twist);
                 let carried_rate: Lane6<S> = load(simd, &carried_rates[g][l]);
                 let step = Lane::load(simd, &del.weights[g]);
-                let stiffness =
-                    dot6(row_rate, carried_rate) + dot6(row_twist, load(simd, &forces[g][l]));
+                let stiffness = dot6(row_rate, carried_rate) + dot6(row_twist, load(simd, &forces[g][l]));
                 // K_ξ̇_l ξ_k for the row's own node is its mirror image.
                 let mut k_row = dot6(twist, load(simd, &carried_rates[g][k]));
                 let mut k_column = dot6(row_twist, carried_rate);

@@ -179,7 +179,13 @@ impl EndBlocks {
     }
 
     /// Copies the entries; in velocity coordinates less `K_q̇q` of the end at γ = s.
-    fn fill(&mut self, tree: &KinematicTree, hessian: &DelHessian, kinetic: Option<&KineticHessian>, s: usize) {
+    fn fill(
+        &mut self,
+        tree: &KinematicTree,
+        hessian: &DelHessian,
+        kinetic: Option<&KineticHessian>,
+        s: usize,
+    ) {
         for i in 0..self.starts.len() - 1 {
             let first = hessian.pair_starts[i];
             for position in 0..tree.branch(i).len() {

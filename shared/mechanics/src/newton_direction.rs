@@ -14,7 +14,6 @@ use crate::del_hessian::DelHessian;
 use crate::del_residual::DelWorkspace;
 use crate::dense_lu::DenseNewton;
 use crate::errors::FactorError;
-use crate::lobatto::MAX_UNKNOWN_NODES;
 use crate::recursive_newton::RecursiveNewton;
 use crate::row_matrix::RowMatrix;
 use crate::spatial::{Twist, Wrench};
@@ -145,19 +144,20 @@ pub(crate) fn jacobian_column_rule(
         let dof = tree.joint_dof(i);
         let first_pair = hessian.pair_starts[i];
         for alpha in 0..s {
-            let shift = Vector6::from(hessian.shift_row(dof, alpha)).transpose() * start_twists;
             for k in 0..6 {
-                let change = shift[k] - hessian.entry(first_pair + k, alpha, 0);
+                let change = hessian.shift_on_base(dof, k, alpha) - hessian.entry(first_pair + k, alpha, 0);
                 put(dof * s + alpha, k * s + last, BaseEntry::Add(change));
             }
         }
         for gamma in 1..=s {
-            let impulse = Vector6::from(hessian.impulse_column(dof, gamma));
-            let projected = end_twists.tr_mul(&impulse);
             for k in 0..6 {
                 let ahead =
                     hessian.mirrored(first_pair + k, 0, gamma) - hessian.mirrored(first_pair + k, s, gamma);
-                put(k * s, dof * s + gamma - 1, BaseEntry::Set(ahead + projected[k]));
+                put(
+                    k * s,
+                    dof * s + gamma - 1,
+                    BaseEntry::Set(ahead + hessian.impulse_on_base(dof, k, gamma)),
+                );
             }
         }
     }
@@ -177,26 +177,21 @@ pub(crate) fn jacobian_column_rule(
     let curved =
         second_order_matrix(del, s, &momentum_end) - second_order_matrix(del, 0, &del.start_momentum());
     let last_column = end_twists.tr_mul(&(shifted_impulse + turned)) + curved;
-    let mut shifts = [Matrix6::zeros(); MAX_UNKNOWN_NODES + 1];
-    for (alpha, shift) in shifts.iter_mut().enumerate().take(s + 1) {
-        *shift = Matrix6::from_fn(|k, c| hessian.shift_row(k, alpha)[c]) * start_twists;
-    }
     for k in 0..6 {
         for l in 0..6 {
             for gamma in 1..=s {
                 for alpha in 1..s {
                     let mut value = hessian.base_entry(k, l, alpha, gamma);
                     if gamma == s {
-                        value += shifts[alpha][(k, l)] - hessian.base_entry(k, l, alpha, 0);
+                        value += hessian.shift_on_base(k, l, alpha) - hessian.base_entry(k, l, alpha, 0);
                     }
                     put(k * s + alpha, l * s + gamma - 1, BaseEntry::Set(value));
                 }
-                let impulse = Vector6::from(hessian.impulse_column(l, gamma));
                 let mut value = hessian.base_entry(k, l, 0, gamma) - hessian.base_entry(k, l, s, gamma)
-                    + end_twists.column(k).dot(&impulse);
+                    + hessian.impulse_on_base(l, k, gamma);
                 if gamma == s {
-                    value += last_column[(k, l)] + shifts[0][(k, l)]
-                        - shifts[s][(k, l)]
+                    value += last_column[(k, l)] + hessian.shift_on_base(k, l, 0)
+                        - hessian.shift_on_base(k, l, s)
                         - (hessian.base_entry(k, l, 0, 0) - hessian.base_entry(k, l, s, 0));
                 }
                 put(k * s, l * s + gamma - 1, BaseEntry::Set(value));
