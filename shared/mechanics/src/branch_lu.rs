@@ -166,15 +166,14 @@ impl BranchLu {
             let (rows, columns) = (&mut self.rows, &mut self.columns);
             let (row_starts, row_quads) = (&self.row_starts, &self.row_quads);
             let (column_starts, column_quads) = (&self.column_starts, &self.column_quads);
-            jacobian_column_rule(tree, del, &self.hessian, |row, column, entry| {
-                let (row_dof, column_dof) = (row / s, column / s);
+            jacobian_column_rule(tree, del, &self.hessian, |[row_dof, alpha], [column_dof, gamma], entry| {
+                let (row, column) = (row_dof * s + alpha, column_dof * s + gamma);
                 // Joint column of a base row: in the column panel; everything else: in the row panel.
                 let target = if column_dof >= 6 {
-                    let quad =
-                        column_starts[column_dof] + (column % s) * column_quads[column_dof] + row / LANES;
+                    let quad = column_starts[column_dof] + gamma * column_quads[column_dof] + row / LANES;
                     &mut columns[quad].0[row % LANES]
                 } else {
-                    let quad = row_starts[row_dof] + (row % s) * row_quads[row_dof] + column / LANES;
+                    let quad = row_starts[row_dof] + alpha * row_quads[row_dof] + column / LANES;
                     &mut rows[quad].0[column % LANES]
                 };
                 match entry {

@@ -127,13 +127,13 @@ pub(crate) enum BaseEntry {
 
 /// Everything in the Newton matrix of a floating tree that is not plainly `H[α,γ]` (module doc of [`crate::del_hessian`]).
 ///
-/// Calls `put(row, column, entry)` in coordinate-major numbering: `Set` for all base-base entries and the joint columns of
+/// Calls `put([coordinate, α], [coordinate, γ - 1], entry)`, row first: `Set` for all base-base entries and the joint columns of
 /// the base rows `α = 0`; `Add` for what comes on top of `H` in the base columns of the joint rows.
 pub(crate) fn jacobian_column_rule(
     tree: &KinematicTree,
     del: &DelWorkspace,
     hessian: &DelHessian,
-    mut put: impl FnMut(usize, usize, BaseEntry),
+    mut put: impl FnMut([usize; 2], [usize; 2], BaseEntry),
 ) {
     let s = del.unknown_nodes();
     let start_twists = base_matrix(del, 0);
@@ -146,18 +146,14 @@ pub(crate) fn jacobian_column_rule(
         for alpha in 0..s {
             for k in 0..6 {
                 let change = hessian.shift_on_base(dof, k, alpha) - hessian.entry(first_pair + k, alpha, 0);
-                put(dof * s + alpha, k * s + last, BaseEntry::Add(change));
+                put([dof, alpha], [k, last], BaseEntry::Add(change));
             }
         }
         for gamma in 1..=s {
             for k in 0..6 {
                 let ahead =
                     hessian.mirrored(first_pair + k, 0, gamma) - hessian.mirrored(first_pair + k, s, gamma);
-                put(
-                    k * s,
-                    dof * s + gamma - 1,
-                    BaseEntry::Set(ahead + hessian.impulse_on_base(dof, k, gamma)),
-                );
+                put([k, 0], [dof, gamma - 1], BaseEntry::Set(ahead + hessian.impulse_on_base(dof, k, gamma)));
             }
         }
     }
@@ -185,7 +181,7 @@ pub(crate) fn jacobian_column_rule(
                     if gamma == s {
                         value += hessian.shift_on_base(k, l, alpha) - hessian.base_entry(k, l, alpha, 0);
                     }
-                    put(k * s + alpha, l * s + gamma - 1, BaseEntry::Set(value));
+                    put([k, alpha], [l, gamma - 1], BaseEntry::Set(value));
                 }
                 let mut value = hessian.base_entry(k, l, 0, gamma) - hessian.base_entry(k, l, s, gamma)
                     + hessian.impulse_on_base(l, k, gamma);
@@ -194,7 +190,7 @@ pub(crate) fn jacobian_column_rule(
                         - hessian.shift_on_base(k, l, s)
                         - (hessian.base_entry(k, l, 0, 0) - hessian.base_entry(k, l, s, 0));
                 }
-                put(k * s, l * s + gamma - 1, BaseEntry::Set(value));
+                put([k, 0], [l, gamma - 1], BaseEntry::Set(value));
             }
         }
     }
