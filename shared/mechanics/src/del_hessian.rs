@@ -338,7 +338,12 @@ impl Kernel for BasePairs<'_> {
     fn run<S: Simd>(self, simd: S) {
         let Self { tree, del, hessian } = self;
         let (s, groups) = (hessian.s, hessian.groups);
-        base_pairs(simd, tree, del, hessian, s, groups);
+        // With constant arguments the loops over nodes unroll.
+        match (s, groups) {
+            (1, 1) if S::SPECIALISE => base_pairs(simd, tree, del, hessian, 1, 1),
+            (2, 1) if S::SPECIALISE => base_pairs(simd, tree, del, hessian, 2, 1),
+            (s, groups) => base_pairs(simd, tree, del, hessian, s, groups),
+        }
         if !hessian.general.is_empty() {
             for i in 0..tree.body_count() {
                 impulse_by_rate(simd, tree, del, hessian, i);
