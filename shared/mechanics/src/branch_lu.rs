@@ -50,6 +50,67 @@ pub struct BranchLu {
     pivots: Vec<f64>,
     base: DenseLu,
     base_rhs: Vec<f64>,
+    /// The same factors in the order in which solves of many columns read them.
+    many: ManyColumns,
+}
+
+/// Blocks for many right-hand sides: every row block gathers from its descendants (leaves to root), then from its ancestors.
+#[derive(Clone, Debug)]
+struct ManyColumns {
+    /// Descendants of every coordinate.
+    descendants: Vec<u32>,
+    descendant_starts: Vec<usize>,
+    /// First pair (coordinate, place on its branch) of every joint coordinate; the coordinate itself left out.
+    pair_starts: Vec<usize>,
+    /// Where a pair stands in `descendants`.
+    places: Vec<u32>,
+    /// `J_ai` for the descendants i of a, s x s row-major.
+    from_descendants: Vec<f64>,
+    /// `D_i J_ib` for the ancestors b of i, s x s row-major.
+    from_ancestors: Vec<f64>,
+    /// Coordinates with non-zero rows in the columns at hand.
+    occupied: Vec<bool>,
+}
+
+impl ManyColumns {
+    fn new(tree: &KinematicTree, s: usize) -> Self {
+        let (n, base) = (tree.dof(), tree.base_dof());
+        let ancestors = |dof: usize| match tree.branch(body_of(tree, dof)) {
+            [ancestors @ .., _] => ancestors,
+            [] => &[],
+        };
+        let mut descendant_starts = vec![0; n + 1];
+        let mut pair_starts = vec![0; n + 1];
+        for dof in 0..n {
+            let own = if dof < base { &[] } else { ancestors(dof) };
+            pair_starts[dof + 1] = pair_starts[dof] + own.len();
+            for &a in own {
+                descendant_starts[a as usize + 1] += 1;
+            }
+        }
+        for a in 0..n {
+            descendant_starts[a + 1] += descendant_starts[a];
+        }
+        let pairs = pair_starts[n];
+        let mut next = descendant_starts.clone();
+        let (mut descendants, mut places) = (vec![0; pairs], Vec::with_capacity(pairs));
+        for dof in base..n {
+            for &a in ancestors(dof) {
+                descendants[next[a as usize]] = dof as u32;
+                places.push(next[a as usize] as u32);
+                next[a as usize] += 1;
+            }
+        }
+        Self {
+            descendants,
+            descendant_starts,
+            pair_starts,
+            places,
+            from_descendants: vec![0.0; pairs * s * s],
+            from_ancestors: vec![0.0; pairs * s * s],
+            occupied: vec![false; n],
+        }
+    }
 }
 
 impl BranchLu {
@@ -83,6 +144,7 @@ impl BranchLu {
             pivots: vec![0.0; tree.dof() * s * s],
             base: DenseLu::new(tree.base_dof() * s),
             base_rhs: vec![0.0; tree.base_dof() * s],
+            many: ManyColumns::new(tree, s),
         }
     }
 
@@ -104,15 +166,14 @@ impl BranchLu {
             let (rows, columns) = (&mut self.rows, &mut self.columns);
             let (row_starts, row_quads) = (&self.row_starts, &self.row_quads);
             let (column_starts, column_quads) = (&self.column_starts, &self.column_quads);
-            jacobian_column_rule(tree, del, &self.hessian, &mut |row, column, entry| {
-                let (row_dof, column_dof) = (row / s, column / s);
+            jacobian_column_rule(tree, del, &self.hessian, |[row_dof, alpha], [column_dof, gamma], entry| {
+                let (row, column) = (row_dof * s + alpha, column_dof * s + gamma);
                 // Joint column of a base row: in the column panel; everything else: in the row panel.
                 let target = if column_dof >= 6 {
-                    let quad =
-                        column_starts[column_dof] + (column % s) * column_quads[column_dof] + row / LANES;
+                    let quad = column_starts[column_dof] + gamma * column_quads[column_dof] + row / LANES;
                     &mut columns[quad].0[row % LANES]
                 } else {
-                    let quad = row_starts[row_dof] + (row % s) * row_quads[row_dof] + column / LANES;
+                    let quad = row_starts[row_dof] + alpha * row_quads[row_dof] + column / LANES;
                     &mut rows[quad].0[column % LANES]
                 };
                 match entry {
@@ -376,9 +437,33 @@ fn subtract_rank<S: Simd, const N: usize>(
     }
 }
 
+/// Copies the factors into the order of [`ManyColumns`].
+#[inline(always)]
+fn gather_factors(lu: &mut BranchLu, base: usize, s: usize) {
+    let many = &mut lu.many;
+    for dof in base..many.pair_starts.len() - 1 {
+        let (quads, column_quads) = (lu.row_quads[dof], lu.column_quads[dof]);
+        let rows = &lu.rows[lu.row_starts[dof]..lu.row_starts[dof] + s * quads];
+        let columns = &lu.columns[lu.column_starts[dof]..lu.column_starts[dof] + s * column_quads];
+        let first = many.pair_starts[dof];
+        for pair in first..many.pair_starts[dof + 1] {
+            let place = many.places[pair] as usize;
+            let above = &mut many.from_ancestors[pair * s * s..(pair + 1) * s * s];
+            let below = &mut many.from_descendants[place * s * s..(place + 1) * s * s];
+            for alpha in 0..s {
+                for k in 0..s {
+                    let (row, column) = ((pair - first) * s + alpha, (pair - first) * s + k);
+                    below[alpha * s + k] = columns[k * column_quads + row / LANES].0[row % LANES];
+                    above[alpha * s + k] = rows[alpha * quads + column / LANES].0[column % LANES];
+                }
+            }
+        }
+    }
+}
+
 struct ForwardMany<'a> {
     tree: &'a KinematicTree,
-    lu: &'a BranchLu,
+    lu: &'a mut BranchLu,
     rhs: &'a mut RowMatrix,
 }
 
@@ -387,64 +472,111 @@ impl Kernel for ForwardMany<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { tree, lu, rhs } = self;
-        for at in (0..rhs.stride()).step_by(WIDE) {
-            match lu.s {
-                1 if S::SPECIALISE => forward_chunk::<S, 1>(simd, tree, lu, rhs, at, 1),
-                2 if S::SPECIALISE => forward_chunk::<S, 2>(simd, tree, lu, rhs, at, 2),
-                3 if S::SPECIALISE => forward_chunk::<S, 3>(simd, tree, lu, rhs, at, 3),
-                s => forward_chunk::<S, MAX_UNKNOWN_NODES>(simd, tree, lu, rhs, at, s),
-            }
+        let base = tree.base_dof();
+        match lu.s {
+            1 if S::SPECIALISE => forward_many::<S, 1>(simd, base, lu, rhs, 1),
+            2 if S::SPECIALISE => forward_many::<S, 2>(simd, base, lu, rhs, 2),
+            3 if S::SPECIALISE => forward_many::<S, 3>(simd, base, lu, rhs, 3),
+            s => forward_many::<S, MAX_UNKNOWN_NODES>(simd, base, lu, rhs, s),
         }
     }
 }
 
 /// Leaves to root, sixteen columns at a time. Columns of the linearisation are zero outside a subtree: those rows are skipped.
 #[inline(always)]
-fn forward_chunk<S: Simd, const N: usize>(
+fn forward_many<S: Simd, const N: usize>(
     simd: S,
-    tree: &KinematicTree,
-    lu: &BranchLu,
+    base: usize,
+    lu: &mut BranchLu,
     rhs: &mut RowMatrix,
-    at: usize,
     s: usize,
 ) {
+    gather_factors(lu, base, s);
     let stride = rhs.stride();
     let data = rhs.quads_mut();
-    let zero = WideLane::splat(simd, 0.0);
-    for dof in (tree.base_dof()..tree.dof()).rev() {
-        let mut x = [zero; N];
-        let mut empty = true;
-        for k in 0..s {
-            x[k] = WideLane::load(simd, data, (dof * s + k) * stride + at);
-            empty &= x[k].is_zero();
-        }
-        if empty {
-            continue;
-        }
-        let inverse = &lu.pivots[dof * s * s..(dof + 1) * s * s];
-        let mut y = [zero; N];
-        for alpha in 0..s {
-            for k in 0..s {
-                y[alpha] = WideLane::splat(simd, inverse[alpha * s + k]).mul_add(x[k], y[alpha]);
-            }
-            y[alpha].store(data, (dof * s + alpha) * stride + at);
-        }
-        let branch = tree.branch(body_of(tree, dof));
-        let quads = lu.column_quads[dof];
-        let columns = &lu.columns[lu.column_starts[dof]..lu.column_starts[dof] + s * quads];
-        for (position, &a) in branch[..branch.len() - 1].iter().enumerate() {
-            for alpha in 0..s {
-                let entry = position * s + alpha;
-                let row = (a as usize * s + alpha) * stride + at;
-                let mut sum = WideLane::load(simd, data, row);
-                for k in 0..s {
-                    let factor = columns[k * quads + entry / LANES].0[entry % LANES];
-                    sum = WideLane::splat(simd, factor).neg_mul_add(y[k], sum);
+    let many = &mut lu.many;
+    for at in (0..stride).step_by(WIDE) {
+        for dof in (0..many.occupied.len()).rev() {
+            let range = many.descendant_starts[dof]..many.descendant_starts[dof + 1];
+            let factors = &many.from_descendants[range.start * s * s..range.end * s * s];
+            let mut sums = start_sums::<S, N>(simd, data, dof * s * stride + at, stride, s);
+            let mut empty = true;
+            for (&i, block) in many.descendants[range].iter().zip(factors.chunks_exact(s * s)) {
+                if many.occupied[i as usize] {
+                    empty = false;
+                    subtract_block(simd, &mut sums, block, data, i as usize * s * stride + at, stride, s);
                 }
-                sum.store(data, row);
+            }
+            let x = total(simd, &sums, s);
+            if empty {
+                for row in x.iter().take(s) {
+                    empty &= row.is_zero();
+                }
+            }
+            many.occupied[dof] = !empty;
+            if empty {
+                continue;
+            }
+            let inverse = &lu.pivots[dof * s * s..(dof + 1) * s * s];
+            for alpha in 0..s {
+                let mut y = x[alpha];
+                if dof >= base {
+                    y = WideLane::splat(simd, 0.0);
+                    for k in 0..s {
+                        y = WideLane::splat(simd, inverse[alpha * s + k]).mul_add(x[k], y);
+                    }
+                }
+                y.store(data, (dof * s + alpha) * stride + at);
             }
         }
     }
+}
+
+/// The rows at `first` as accumulators, one per row and column of a block: the products of a block do not wait for each other.
+#[inline(always)]
+fn start_sums<S: Simd, const N: usize>(
+    simd: S,
+    data: &[Quad],
+    first: usize,
+    stride: usize,
+    s: usize,
+) -> [[WideLane<S>; N]; N] {
+    let mut sums = [[WideLane::splat(simd, 0.0); N]; N];
+    for alpha in 0..s {
+        sums[0][alpha] = WideLane::load(simd, data, first + alpha * stride);
+    }
+    sums
+}
+
+/// `sums -= block y` for the rows `y` at `from`.
+#[inline(always)]
+fn subtract_block<S: Simd, const N: usize>(
+    simd: S,
+    sums: &mut [[WideLane<S>; N]; N],
+    block: &[f64],
+    data: &[Quad],
+    from: usize,
+    stride: usize,
+    s: usize,
+) {
+    for k in 0..s {
+        let y = WideLane::load(simd, data, from + k * stride);
+        for alpha in 0..s {
+            sums[k][alpha] = WideLane::splat(simd, block[alpha * s + k]).neg_mul_add(y, sums[k][alpha]);
+        }
+    }
+}
+
+#[inline(always)]
+fn total<S: Simd, const N: usize>(simd: S, sums: &[[WideLane<S>; N]; N], s: usize) -> [WideLane<S>; N] {
+    let one = WideLane::splat(simd, 1.0);
+    let mut out = sums[0];
+    for k in 1..s {
+        for alpha in 0..s {
+            out[alpha] = one.mul_add(sums[k][alpha], out[alpha]);
+        }
+    }
+    out
 }
 
 struct BackwardMany<'a> {
@@ -458,54 +590,38 @@ impl Kernel for BackwardMany<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { tree, lu, rhs } = self;
-        for at in (0..rhs.stride()).step_by(WIDE) {
-            match lu.s {
-                1 if S::SPECIALISE => backward_chunk::<S, 1>(simd, tree, lu, rhs, at, 1),
-                2 if S::SPECIALISE => backward_chunk::<S, 2>(simd, tree, lu, rhs, at, 2),
-                3 if S::SPECIALISE => backward_chunk::<S, 3>(simd, tree, lu, rhs, at, 3),
-                s => backward_chunk::<S, MAX_UNKNOWN_NODES>(simd, tree, lu, rhs, at, s),
-            }
+        match lu.s {
+            1 if S::SPECIALISE => backward_many::<S, 1>(simd, tree, lu, rhs, 1),
+            2 if S::SPECIALISE => backward_many::<S, 2>(simd, tree, lu, rhs, 2),
+            3 if S::SPECIALISE => backward_many::<S, 3>(simd, tree, lu, rhs, 3),
+            s => backward_many::<S, MAX_UNKNOWN_NODES>(simd, tree, lu, rhs, s),
         }
     }
 }
 
 /// Root to leaves, sixteen columns at a time.
 #[inline(always)]
-fn backward_chunk<S: Simd, const N: usize>(
+fn backward_many<S: Simd, const N: usize>(
     simd: S,
     tree: &KinematicTree,
     lu: &BranchLu,
     rhs: &mut RowMatrix,
-    at: usize,
     s: usize,
 ) {
     let stride = rhs.stride();
     let data = rhs.quads_mut();
-    let zero = WideLane::splat(simd, 0.0);
-    for dof in tree.base_dof()..tree.dof() {
-        let branch = tree.branch(body_of(tree, dof));
-        let quads = lu.row_quads[dof];
-        let rows = &lu.rows[lu.row_starts[dof]..lu.row_starts[dof] + s * quads];
-        // Two accumulators per row hide the latency of the multiply-add.
-        let mut sums = [[zero; N]; 2];
-        for alpha in 0..s {
-            sums[0][alpha] = WideLane::load(simd, data, (dof * s + alpha) * stride + at);
-        }
-        for (position, &b) in branch[..branch.len() - 1].iter().enumerate() {
-            for k in 0..s {
-                let entry = position * s + k;
-                let y = WideLane::load(simd, data, (b as usize * s + k) * stride + at);
-                let sum = &mut sums[position % 2];
-                for alpha in 0..s {
-                    let factor = rows[alpha * quads + entry / LANES].0[entry % LANES];
-                    sum[alpha] = WideLane::splat(simd, factor).neg_mul_add(y, sum[alpha]);
-                }
+    let many = &lu.many;
+    for at in (0..stride).step_by(WIDE) {
+        for dof in tree.base_dof()..tree.dof() {
+            let range = many.pair_starts[dof]..many.pair_starts[dof + 1];
+            let factors = &many.from_ancestors[range.start * s * s..range.end * s * s];
+            let mut sums = start_sums::<S, N>(simd, data, dof * s * stride + at, stride, s);
+            for (&b, block) in tree.branch(body_of(tree, dof)).iter().zip(factors.chunks_exact(s * s)) {
+                subtract_block(simd, &mut sums, block, data, b as usize * s * stride + at, stride, s);
             }
-        }
-        let one = WideLane::splat(simd, 1.0);
-        for alpha in 0..s {
-            let total = one.mul_add(sums[0][alpha], sums[1][alpha]);
-            total.store(data, (dof * s + alpha) * stride + at);
+            for (alpha, row) in total(simd, &sums, s).into_iter().enumerate().take(s) {
+                row.store(data, (dof * s + alpha) * stride + at);
+            }
         }
     }
 }
@@ -525,9 +641,11 @@ impl Kernel for SolveOne<'_> {
         match (forward, lu.s) {
             (true, 1) => forward_one(tree, lu, rhs, 1),
             (true, 2) => forward_one(tree, lu, rhs, 2),
+            (true, 3) => forward_one(tree, lu, rhs, 3),
             (true, s) => forward_one(tree, lu, rhs, s),
             (false, 1) => backward_one(tree, lu, rhs, 1),
             (false, 2) => backward_one(tree, lu, rhs, 2),
+            (false, 3) => backward_one(tree, lu, rhs, 3),
             (false, s) => backward_one(tree, lu, rhs, s),
         }
     }

@@ -37,7 +37,7 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use crate::del_residual::{DelWorkspace, load_arm};
-use crate::floating_base::{BaseLanes, second_order, second_order_rate};
+use crate::floating_base::{BaseLanes, base_project, second_order, second_order_rate};
 use crate::gravity_hessian::gravity_column;
 use crate::kinetic_hessian::{CompositeLanes, composite_times, kinetic_columns, own_inertia};
 use crate::lanes::{
@@ -122,6 +122,11 @@ pub struct DelHessian {
     shift_rows: Vec<[Quad; 6]>,
     /// Change of the total impulse by coordinate `dof` at node γ (lanes): `[dof groups + g]`.
     impulse_columns: Vec<[Quad; 6]>,
+    /// Columns of `(𝒴 - ad^D_Γ) w_α Δt` of the base, the change of the total impulse by a rigid shift at node α (lanes): `[k groups + g]`.
+    rigid_columns: Vec<[Quad; 6]>,
+    /// `S^0ᵀ` of the shift rows, lanes over α, and `S^sᵀ` of the impulse columns, lanes over γ: `[dof groups + g]`.
+    shifts_on_base: Vec<[Quad; 6]>,
+    impulses_on_base: Vec<[Quad; 6]>,
 }
 
 impl DelHessian {
@@ -158,6 +163,9 @@ impl DelHessian {
             base_blocks: vec![Quad::ZERO; if floating { 36 * block } else { 0 }],
             shift_rows: vec![[Quad::ZERO; 6]; if floating { tree.dof() * groups } else { 0 }],
             impulse_columns: vec![[Quad::ZERO; 6]; if floating { tree.dof() * groups } else { 0 }],
+            rigid_columns: vec![[Quad::ZERO; 6]; if floating { 6 * groups } else { 0 }],
+            shifts_on_base: vec![[Quad::ZERO; 6]; if floating { tree.dof() * groups } else { 0 }],
+            impulses_on_base: vec![[Quad::ZERO; 6]; if floating { tree.dof() * groups } else { 0 }],
         }
     }
 
@@ -203,14 +211,6 @@ impl DelHessian {
         self.blocks[(pair * (self.s + 1) + alpha) * self.groups + gamma / LANES].0[gamma % LANES]
     }
 
-    /// The blocks `H_ij` and, unless they are their transposes, `H_ji` of a pair: rows α of `length / (s + 1)` quads over γ.
-    #[inline(always)]
-    pub(crate) fn pair_blocks(&self, pair: usize, length: usize) -> (&[Quad], Option<&[Quad]>) {
-        let range = pair * length..(pair + 1) * length;
-        let mirror = if self.mirror.is_empty() { None } else { Some(&self.mirror[range.clone()]) };
-        (&self.blocks[range], mirror)
-    }
-
     /// `H[α,γ]` with the branch coordinate as row and the joint of the body as column.
     #[inline(always)]
     pub(crate) fn mirrored(&self, pair: usize, alpha: usize, gamma: usize) -> f64 {
@@ -237,6 +237,24 @@ impl DelHessian {
     #[inline]
     pub(crate) fn impulse_column(&self, dof: usize, gamma: usize) -> [f64; 6] {
         self.impulse_columns[dof * self.groups + gamma / LANES].map(|q| q.0[gamma % LANES])
+    }
+
+    /// `S^0ᵀ` of [`DelHessian::shift_row`], component `k`.
+    #[inline(always)]
+    pub(crate) fn shift_on_base(&self, dof: usize, k: usize, alpha: usize) -> f64 {
+        self.shifts_on_base[dof * self.groups + alpha / LANES][k].0[alpha % LANES]
+    }
+
+    /// `S^sᵀ` of [`DelHessian::impulse_column`], component `k`.
+    #[inline(always)]
+    pub(crate) fn impulse_on_base(&self, dof: usize, k: usize, gamma: usize) -> f64 {
+        self.impulses_on_base[dof * self.groups + gamma / LANES][k].0[gamma % LANES]
+    }
+
+    /// `(𝒴 - ad^D_Γ)^α e_k` of the base, times `w_α Δt`.
+    #[inline]
+    pub(crate) fn rigid_column(&self, k: usize, alpha: usize) -> [f64; 6] {
+        self.rigid_columns[k * self.groups + alpha / LANES].map(|q| q.0[alpha % LANES])
     }
 
     /// `H[α,γ]` as a dense matrix of joint coordinates (row-major, `joints²`), fixed base. For tests and small models.
@@ -320,12 +338,36 @@ impl Kernel for BasePairs<'_> {
     fn run<S: Simd>(self, simd: S) {
         let Self { tree, del, hessian } = self;
         let (s, groups) = (hessian.s, hessian.groups);
-        base_pairs(simd, tree, del, hessian, s, groups);
+        // With constant arguments the loops over nodes unroll.
+        match (s, groups) {
+            (1, 1) if S::SPECIALISE => base_pairs(simd, tree, del, hessian, 1, 1),
+            (2, 1) if S::SPECIALISE => base_pairs(simd, tree, del, hessian, 2, 1),
+            (s, groups) => base_pairs(simd, tree, del, hessian, s, groups),
+        }
         if !hessian.general.is_empty() {
             for i in 0..tree.body_count() {
                 impulse_by_rate(simd, tree, del, hessian, i);
             }
         }
+        project_on_base(simd, del, hessian);
+    }
+}
+
+/// `S^0ᵀ` of the shift rows and `S^sᵀ` of the impulse columns.
+#[inline(always)]
+fn project_on_base<S: Simd>(simd: S, del: &DelWorkspace, hessian: &mut DelHessian) {
+    let s = hessian.s;
+    let [start, end] = [0, s].map(|alpha| {
+        let base = &del.base[alpha / LANES];
+        let spread = |quad: &Quad| Quad::splat(quad.0[alpha % LANES]);
+        let (z, position) = (base.z.each_ref().map(spread), base.position.each_ref().map(spread));
+        BaseLanes { z, position, ..*base }
+    });
+    for (shift, on_base) in hessian.shift_rows.iter().zip(&mut hessian.shifts_on_base) {
+        *on_base = store(base_project(simd, &start, load(simd, shift)));
+    }
+    for (impulse, on_base) in hessian.impulse_columns.iter().zip(&mut hessian.impulses_on_base) {
+        *on_base = store(base_project(simd, &end, load(simd, impulse)));
     }
 }
 
@@ -710,6 +752,7 @@ fn base_pairs<S: Simd>(
             let column = hessian.columns[k * groups + g];
             let (twist, rate) = (load(simd, &column.twist), load(simd, &column.rate));
             shift_and_impulse(simd, tree, del, hessian, 0, g, k, twist, rate);
+            rigid_column(simd, tree, del, hessian, g, k);
         }
     }
     let tables = Tables {
@@ -731,33 +774,46 @@ fn base_pairs<S: Simd>(
             store(second_order(simd, base, load(simd, &body.impulse))),
         ];
     }
+    // What a column brings to all its rows: 𝓜S, 𝓜Ṡ, ad^D_μ Ṡ + 𝒴S + 𝒵Ṡ, 𝒵S.
+    let mut carried = [[[Quad::ZERO; 6]; 6]; MAX_GROUPS];
+    let mut carried_rates = [[[Quad::ZERO; 6]; 6]; MAX_GROUPS];
+    let mut forces = [[[Quad::ZERO; 6]; 6]; MAX_GROUPS];
+    let mut drags = [[[Quad::ZERO; 6]; 6]; MAX_GROUPS];
+    for g in 0..groups {
+        let momentum: Lane6<S> = load(simd, &del.bodies[g].momentum);
+        for l in 0..6 {
+            let column = &hessian.columns[l * groups + g];
+            let (twist, rate): (Lane6<S>, Lane6<S>) = (load(simd, &column.twist), load(simd, &column.rate));
+            carried[g][l] = store(composite_times(simd, mass, &hessian.composites[g], twist));
+            carried_rates[g][l] = store(composite_times(simd, mass, &hessian.composites[g], rate));
+            let mut force = add(
+                dual_bracket(momentum, rate),
+                fixed_direction_gain(simd, tree, del, hessian, 0, g, twist),
+            );
+            if let Some(general) = hessian.general.get(g) {
+                force = add(force, matrix_times(simd, &general.nu, rate));
+                force = add(force, matrix_times(simd, &general.eta, twist));
+                drags[g][l] = store(matrix_times(simd, &general.nu, twist));
+            }
+            forces[g][l] = store(force);
+        }
+    }
     for k in 0..6 {
         for l in 0..6 {
             let mut terms = PairTerms::default();
             for g in 0..groups {
-                let body = &del.bodies[g];
-                let composite = &hessian.composites[g];
-                let momentum: Lane6<S> = load(simd, &body.momentum);
-                let (row, column) = (&hessian.columns[k * groups + g], &hessian.columns[l * groups + g]);
+                let row = &hessian.columns[k * groups + g];
                 let (row_twist, row_rate): (Lane6<S>, Lane6<S>) =
                     (load(simd, &row.twist), load(simd, &row.rate));
-                let (twist, rate): (Lane6<S>, Lane6<S>) =
-                    (load(simd, &column.twist), load(simd, &column.rate));
-                let carried = composite_times(simd, mass, composite, twist);
-                let carried_rate = composite_times(simd, mass, composite, rate);
+                let twist: Lane6<S> = load(simd, &hessian.columns[l * groups + g].twist);
+                let carried_rate: Lane6<S> = load(simd, &carried_rates[g][l]);
                 let step = Lane::load(simd, &del.weights[g]);
-                let mut stiffness =
-                    dot6(row_rate, carried_rate) + dot6(row_twist, dual_bracket(momentum, rate));
-                let gain = fixed_direction_gain(simd, tree, del, hessian, 0, g, twist);
-                stiffness = stiffness + dot6(row_twist, gain);
+                let stiffness = dot6(row_rate, carried_rate) + dot6(row_twist, load(simd, &forces[g][l]));
                 // K_ξ̇_l ξ_k for the row's own node is its mirror image.
-                let mut k_row = dot6(twist, composite_times(simd, mass, composite, row_rate));
+                let mut k_row = dot6(twist, load(simd, &carried_rates[g][k]));
                 let mut k_column = dot6(row_twist, carried_rate);
-                if let Some(general) = hessian.general.get(g) {
-                    let moved = matrix_times(simd, &general.nu, rate);
-                    let posed = matrix_times(simd, &general.eta, twist);
-                    stiffness = stiffness + dot6(row_twist, add(moved, posed));
-                    k_row = k_row + dot6(row_twist, matrix_times(simd, &general.nu, twist));
+                if !hessian.general.is_empty() {
+                    k_row = k_row + dot6(row_twist, load(simd, &drags[g][l]));
                 }
                 let mut scaled = step * stiffness;
                 let [n, n_rate, n_impulse] = &curved[g];
@@ -770,7 +826,7 @@ fn base_pairs<S: Simd>(
                 if k < 3 {
                     k_row = k_row + Lane::load(simd, &n[3 * l + k]);
                 }
-                terms.mass[g] = dot6(row_twist, carried).quad();
+                terms.mass[g] = dot6(row_twist, load(simd, &carried[g][l])).quad();
                 terms.stiffness[g] = scaled.quad();
                 terms.row[g] = k_row.quad();
                 terms.column[g] = k_column.quad();
@@ -779,4 +835,25 @@ fn base_pairs<S: Simd>(
             mix(simd, &tables, &terms, s, groups, &mut hessian.base_blocks[at..at + block]);
         }
     }
+}
+
+/// Change of the total impulse by the unit twist `k` of all that the base carries.
+#[inline(always)]
+fn rigid_column<S: Simd>(
+    simd: S,
+    tree: &KinematicTree,
+    del: &DelWorkspace,
+    hessian: &mut DelHessian,
+    g: usize,
+    k: usize,
+) {
+    let mut twist = [Lane::splat(simd, 0.0); 6];
+    twist[k] = Lane::splat(simd, 1.0);
+    let mut gain = fixed_direction_gain(simd, tree, del, hessian, 0, g, twist);
+    if let Some(general) = hessian.general.get(g) {
+        gain = add(gain, matrix_times(simd, &general.eta, twist));
+    }
+    let turned = dual_bracket(load(simd, &del.bodies[g].impulse), twist);
+    let step = Lane::load(simd, &del.weights[g]);
+    hessian.rigid_columns[k * hessian.groups + g] = store(sub(scale(step, gain), turned));
 }

@@ -117,6 +117,8 @@ pub struct DelWorkspace {
     pub(crate) center: RigidTransform,
     load_capacity: usize,
     projections: Vec<[Quad; 6]>,
+    /// `(sin, cos)` of the joint coordinates at the start.
+    start_sin_cos: Vec<(f64, f64)>,
 }
 
 impl DelWorkspace {
@@ -167,6 +169,7 @@ impl DelWorkspace {
             capacity,
             load_capacity,
             projections: vec![[Quad::ZERO; 6]; groups],
+            start_sin_cos: vec![(0.0, 1.0); tree.joint_count()],
         };
         for alpha in 0..nodes {
             for beta in 0..nodes {
@@ -227,6 +230,9 @@ impl DelWorkspace {
     ) -> Result<(), StepError> {
         self.check_inputs(tree, state, forces)?;
         self.start.copy_from(state);
+        for (turn, &q) in self.start_sin_cos.iter_mut().zip(&state.q) {
+            *turn = sin_cos(q);
+        }
         let groups = self.groups;
         self.q.fill(Quad::ZERO);
         self.set_joint_forces(tree, &forces.joints);
@@ -412,6 +418,7 @@ impl DelWorkspace {
     /// `(q, q̇)` number `k`.
     pub(crate) fn evaluate_states(&mut self, tree: &KinematicTree, states: &[(&[f64], &[f64])]) {
         self.start.q.fill(0.0);
+        self.start_sin_cos.fill((0.0, 1.0));
         for (lane, (q, q_dot)) in states.iter().enumerate() {
             for dof in 0..tree.dof() {
                 self.q[dof * self.groups].0[lane] = q[dof];
@@ -519,12 +526,17 @@ impl DelWorkspace {
         total
     }
 
-    /// `S^αᵀ X` of the floating base.
-    pub(crate) fn project_base(&self, alpha: usize, wrench: &Wrench) -> [f64; 6] {
+    /// `Z^α` and the mass centre `p^α` of the floating base.
+    pub(crate) fn base_turn_and_position(&self, alpha: usize) -> (Matrix3<f64>, Vector3<f64>) {
         let base = &self.base[alpha / LANES];
         let lane = alpha % LANES;
         let z = Matrix3::from_fn(|r, c| base.z[3 * r + c].0[lane]);
-        let position = Vector3::from_fn(|r, _| base.position[r].0[lane]);
+        (z, Vector3::from_fn(|r, _| base.position[r].0[lane]))
+    }
+
+    /// `S^αᵀ X` of the floating base.
+    pub(crate) fn project_base(&self, alpha: usize, wrench: &Wrench) -> [f64; 6] {
+        let (z, position) = self.base_turn_and_position(alpha);
         let upper = z.tr_mul(&(wrench.torque - position.cross(&wrench.force)));
         let lower = self.center.rotation.tr_mul(&wrench.force);
         [upper.x, upper.y, upper.z, lower.x, lower.y, lower.z]
@@ -629,22 +641,14 @@ fn joint_outward<S: Simd>(simd: S, tree: &KinematicTree, workspace: &mut DelWork
     let groups = workspace.groups;
     let constants = &tree.constants()[i];
     let dof = tree.joint_dof(i) * groups + g;
-    let origin = workspace.start.q[tree.joint_dof(i) - tree.base_dof()];
-    let q = Quad(workspace.q[dof].0.map(|change| origin + change));
+    let start_q = workspace.start.q[tree.joint_dof(i) - tree.base_dof()];
+    let change = &workspace.q[dof];
     let q_dot = Lane::load(simd, &workspace.q_dot[dof]);
 
     let mut e: Lane9<S> = splat(simd, &constants.e0);
     if constants.revolute {
-        let (mut sin, mut versine) = (Quad::ZERO, Quad::ZERO);
-        for lane in 0..LANES {
-            if g * LANES + lane > workspace.rule.unknown_nodes() {
-                break;
-            }
-            let (s, c) = sin_cos(q.0[lane]);
-            sin.0[lane] = s;
-            versine.0[lane] = 1.0 - c;
-        }
-        let (sin, versine) = (Lane::load(simd, &sin), Lane::load(simd, &versine));
+        let start = workspace.start_sin_cos[tree.joint_dof(i) - tree.base_dof()];
+        let (sin, versine) = sin_versine(simd, start_q, start, change);
         for k in 0..9 {
             let bend = versine.mul_add(Lane::splat(simd, constants.e2[k]), e[k]);
             e[k] = sin.mul_add(Lane::splat(simd, constants.e1[k]), bend);
@@ -670,7 +674,7 @@ fn joint_outward<S: Simd>(simd: S, tree: &KinematicTree, workspace: &mut DelWork
     let joint_twist = if constants.revolute {
         join(axis, cross(origin, axis))
     } else {
-        let travel = Lane::load(simd, &q);
+        let travel = Lane::load(simd, change) + Lane::splat(simd, start_q);
         position = crate::lanes::scale_add(travel, axis, position);
         join([zero; 3], axis)
     };
@@ -684,6 +688,51 @@ fn joint_outward<S: Simd>(simd: S, tree: &KinematicTree, workspace: &mut DelWork
     body.joint_twist_rate = store(crate::lanes::bracket(parent_velocity, joint_twist));
     body.velocity = store(velocity);
     body.momentum = store(momentum);
+}
+
+/// Largest change of an angle (rad) for which the series below are exact to round-off.
+const SERIES_LIMIT: f64 = 0.5;
+/// `(-1)^k / (2k+1)!`, k = 1..6, highest first: `sin d = d + d Σ ...`.
+const SINE: [f64; 6] =
+    [1.0 / 6_227_020_800.0, -1.0 / 39_916_800.0, 1.0 / 362_880.0, -1.0 / 5_040.0, 1.0 / 120.0, -1.0 / 6.0];
+/// `(-1)^k / (2k)!`, k = 1..7, highest first: `cos d - 1 = Σ ...`.
+const COSINE: [f64; 7] = [
+    -1.0 / 87_178_291_200.0,
+    1.0 / 479_001_600.0,
+    -1.0 / 3_628_800.0,
+    1.0 / 40_320.0,
+    -1.0 / 720.0,
+    1.0 / 24.0,
+    -0.5,
+];
+
+/// `sin q` and `1 - cos q` at `q = start_q + change`, with `start = (sin, cos)` of `start_q`. Changes within a step are small: their series, added to the angle of the start by
+/// the addition theorem, run in lanes; larger ones go one by one.
+#[inline(always)]
+fn sin_versine<S: Simd>(simd: S, start_q: f64, start: (f64, f64), change: &Quad) -> (Lane<S>, Lane<S>) {
+    if change.0.iter().all(|d| d.abs() <= SERIES_LIMIT) {
+        let d = Lane::load(simd, change);
+        let square = d * d;
+        let (mut sine, mut cosine) = (Lane::splat(simd, SINE[0]), Lane::splat(simd, COSINE[0]));
+        for k in 1..SINE.len() {
+            sine = sine.mul_add(square, Lane::splat(simd, SINE[k]));
+        }
+        for k in 1..COSINE.len() {
+            cosine = cosine.mul_add(square, Lane::splat(simd, COSINE[k]));
+        }
+        let sine = (sine * square).mul_add(d, d);
+        let cosine = cosine * square;
+        let (sin, cos) = (Lane::splat(simd, start.0), Lane::splat(simd, start.1));
+        let versine = Lane::splat(simd, 1.0 - start.1);
+        return (sin + sin.mul_add(cosine, cos * sine), versine + sin.mul_add(sine, -(cos * cosine)));
+    }
+    let (mut sin, mut versine) = (Quad::ZERO, Quad::ZERO);
+    for lane in 0..LANES {
+        let (s, c) = sin_cos(start_q + change.0[lane]);
+        sin.0[lane] = s;
+        versine.0[lane] = 1.0 - c;
+    }
+    (Lane::load(simd, &sin), Lane::load(simd, &versine))
 }
 
 /// `M_i v_i` of one body about the origin of {0}.

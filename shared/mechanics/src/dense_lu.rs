@@ -8,7 +8,7 @@ use alloc::vec::Vec;
 use crate::del_hessian::DelHessian;
 use crate::del_residual::DelWorkspace;
 use crate::errors::FactorError;
-use crate::newton_direction::{NewtonDirection, jacobian_column_rule};
+use crate::newton_direction::{BaseEntry, NewtonDirection, jacobian_column_rule};
 use crate::row_matrix::RowMatrix;
 use crate::tree::KinematicTree;
 
@@ -149,9 +149,12 @@ impl DenseNewton {
             }
         }
         if base > 0 {
-            jacobian_column_rule(tree, del, &self.hessian, &mut |row, column, change| match change {
-                crate::newton_direction::BaseEntry::Set(value) => entries[row * order + column] = value,
-                crate::newton_direction::BaseEntry::Add(value) => entries[row * order + column] += value,
+            jacobian_column_rule(tree, del, &self.hessian, |[row, alpha], [column, gamma], entry| {
+                let target = &mut entries[(row * s + alpha) * order + column * s + gamma];
+                match entry {
+                    BaseEntry::Set(value) => *target = value,
+                    BaseEntry::Add(value) => *target += value,
+                }
             });
         }
         entries

@@ -35,7 +35,8 @@ use crate::del_hessian::DelHessian;
 use crate::del_residual::DelWorkspace;
 use crate::errors::{ModelError, StepError};
 use crate::kinetic_hessian::KineticHessian;
-use crate::lanes::{Kernel, LANES, Simd, WIDE, WideLane};
+use crate::lanes::{Kernel, Simd, WIDE, WideLane};
+use crate::lobatto::MAX_UNKNOWN_NODES;
 use crate::mass_matrix_factor::MassMatrixFactor;
 use crate::newton_direction::{NewtonDirection, NewtonSolver};
 use crate::recursive_linearize::{AllColumns, ColumnSweeps};
@@ -128,6 +129,82 @@ pub struct Linearizer {
     deep: bool,
     column: Vec<f64>,
     momentum: Vec<f64>,
+    end: EndBlocks,
+}
+
+/// Row s of the Hessian, `H[s,γ]` for γ = 1..s, row by row: every coordinate with all that share a branch with it.
+#[derive(Clone, Debug)]
+struct EndBlocks {
+    related: Vec<u32>,
+    starts: Vec<usize>,
+    /// Where pair `(i, j)`, j on the branch of i, stands in row i and in row j.
+    places: Vec<[u32; 2]>,
+    /// `s` entries for every one of `related`.
+    entries: Vec<f64>,
+}
+
+impl EndBlocks {
+    /// Fixed base; empty for a floating one.
+    fn new(tree: &KinematicTree, s: usize) -> Self {
+        let n = if tree.is_floating() { 0 } else { tree.dof() };
+        let mut starts = vec![0; n + 1];
+        for i in 0..n {
+            for &j in tree.branch(i) {
+                starts[i + 1] += 1;
+                if j as usize != i {
+                    starts[j as usize + 1] += 1;
+                }
+            }
+        }
+        for i in 0..n {
+            starts[i + 1] += starts[i];
+        }
+        let mut next = starts.clone();
+        let mut related = vec![0; starts[n]];
+        let mut take = |row: usize, column: usize| {
+            let place = next[row];
+            related[place] = column as u32;
+            next[row] += 1;
+            place as u32
+        };
+        let mut places = Vec::new();
+        for i in 0..n {
+            for &j in tree.branch(i) {
+                let j = j as usize;
+                let own = take(i, j);
+                places.push([own, if i == j { own } else { take(j, i) }]);
+            }
+        }
+        Self { entries: vec![0.0; related.len() * s], related, starts, places }
+    }
+
+    /// Copies the entries; in velocity coordinates less `K_q̇q` of the end at γ = s.
+    fn fill(
+        &mut self,
+        tree: &KinematicTree,
+        hessian: &DelHessian,
+        kinetic: Option<&KineticHessian>,
+        s: usize,
+    ) {
+        for i in 0..self.starts.len() - 1 {
+            let first = hessian.pair_starts[i];
+            for position in 0..tree.branch(i).len() {
+                let [own, other] = self.places[first + position].map(|place| place as usize * s);
+                let pair = first + position;
+                for gamma in 1..=s {
+                    self.entries[other + gamma - 1] = hessian.mirrored(pair, s, gamma);
+                    self.entries[own + gamma - 1] = hessian.entry(pair, s, gamma);
+                }
+                if let Some(kinetic) = kinetic {
+                    let terms = kinetic.pair(i, position);
+                    if own != other {
+                        self.entries[other + s - 1] -= terms[2].0[1];
+                    }
+                    self.entries[own + s - 1] -= terms[1].0[1];
+                }
+            }
+        }
+    }
 }
 
 impl Linearizer {
@@ -173,6 +250,7 @@ impl Linearizer {
             },
             column: vec![0.0; s * n],
             momentum: vec![0.0; n],
+            end: EndBlocks::new(tree, s),
         })
     }
 
@@ -211,8 +289,7 @@ impl Linearizer {
         if self.coordinates == StateCoordinates::Velocity {
             self.evaluate_velocities(tree, integrator)?;
         }
-        let (del, solver) = integrator.del_and_solver();
-        solver.factor(tree, del)?;
+        let (del, solver) = integrator.factor_solution(tree)?;
         if solver.hessian().is_none() {
             self.hessian.evaluate(tree, del);
         }
@@ -226,14 +303,9 @@ impl Linearizer {
         );
         solver.solve_many(tree, &mut self.z);
         let hessian = solver.hessian().unwrap_or(&self.hessian);
-        del.instructions.dispatch_wide(EndRows {
-            tree,
-            hessian,
-            kinetic: self.kinetic.as_ref(),
-            z: &self.z,
-            out: &mut self.step.matrix,
-            s: self.s,
-        });
+        self.end.fill(tree, hessian, self.kinetic.as_ref(), self.s);
+        let out = &mut self.step.matrix;
+        del.instructions.dispatch_wide(EndRows { blocks: &self.end, z: &self.z, out, s: self.s });
         self.add_direct_terms(tree, del, solver);
         if self.kinetic.is_some() {
             del.instructions.dispatch_wide(SolveMass { factor: &self.factor, out: &mut self.step.matrix });
@@ -333,8 +405,7 @@ impl Linearizer {
             let reason = "the tangent path gives momentum coordinates";
             return Err(ModelError::Unsupported { body: 0, reason }.into());
         }
-        let (del, solver) = integrator.del_and_solver();
-        solver.factor(tree, del)?;
+        let (del, solver) = integrator.factor_solution(tree)?;
         let n = tree.dof();
         for column in 0..self.step.matrix.columns() {
             self.tangent_column(tree, del, solver, column, n);
@@ -452,8 +523,7 @@ impl Linearizer {
                 return Err(ModelError::Length { quantity, got, expected }.into());
             }
         }
-        let (del, solver) = integrator.del_and_solver();
-        solver.factor(tree, del)?;
+        let (del, solver) = integrator.factor_solution(tree)?;
         if solver.hessian().is_none() {
             self.hessian.evaluate(tree, del);
         }
@@ -559,9 +629,7 @@ fn fill_right_hand_sides(
 
 /// Rows of `q_{k+1}` (copied) and of `p_{k+1}`: `Σ_γ H[s,γ] Z^γ`, minus `K_q̇q Z^s` in velocity coordinates.
 struct EndRows<'a> {
-    tree: &'a KinematicTree,
-    hessian: &'a DelHessian,
-    kinetic: Option<&'a KineticHessian>,
+    blocks: &'a EndBlocks,
     z: &'a RowMatrix,
     out: &'a mut RowMatrix,
     s: usize,
@@ -571,63 +639,49 @@ impl Kernel for EndRows<'_> {
     type Output = ();
     #[inline(always)]
     fn run<S: Simd>(mut self, simd: S) {
-        for at in (0..self.z.stride()).step_by(WIDE) {
-            match (self.s, self.hessian.groups) {
-                (1, 1) if S::SPECIALISE => end_chunk(simd, &mut self, at, 1, 1),
-                (2, 1) if S::SPECIALISE => end_chunk(simd, &mut self, at, 2, 1),
-                (s, groups) => end_chunk(simd, &mut self, at, s, groups),
-            }
+        match self.s {
+            1 if S::SPECIALISE => end_rows::<S, 1>(simd, &mut self, 1),
+            2 if S::SPECIALISE => end_rows::<S, 2>(simd, &mut self, 2),
+            s => end_rows::<S, MAX_UNKNOWN_NODES>(simd, &mut self, s),
         }
     }
 }
 
 #[inline(always)]
-fn end_chunk<S: Simd>(simd: S, work: &mut EndRows<'_>, at: usize, s: usize, groups: usize) {
-    let (tree, hessian) = (work.tree, work.hessian);
+fn end_rows<S: Simd, const N: usize>(simd: S, work: &mut EndRows<'_>, s: usize) {
     let stride = work.z.stride();
     let z = work.z.quads();
     let out = work.out.quads_mut();
-    let n = tree.dof();
-    let zero = WideLane::splat(simd, 0.0);
-    for i in 0..n {
-        WideLane::load(simd, z, (i * s + s - 1) * stride + at).store(out, i * stride + at);
-        zero.store(out, (n + i) * stride + at);
-    }
-    for i in 0..n {
-        let first = hessian.pair_starts[i];
-        let mut sum = zero;
-        for (position, &j) in tree.branch(i).iter().enumerate() {
-            let j = j as usize;
-            let pair = first + position;
-            let (block, mirror) = hessian.pair_blocks(pair, (s + 1) * groups);
-            let (mut own_rate, mut other_rate) = (0.0, 0.0);
-            if let Some(kinetic) = work.kinetic {
-                let terms = kinetic.pair(i, position);
-                (own_rate, other_rate) = (terms[1].0[1], terms[2].0[1]);
-            }
-            let target = (n + j) * stride + at;
-            let mut moved = WideLane::load(simd, out, target);
-            for gamma in 1..=s {
-                let mut ahead = block[s * groups + gamma / LANES].0[gamma % LANES];
-                let mut behind = match mirror {
-                    Some(mirror) => mirror[s * groups + gamma / LANES].0[gamma % LANES],
-                    None => block[gamma * groups + s / LANES].0[s % LANES],
-                };
-                if gamma == s {
-                    ahead -= own_rate;
-                    behind -= other_rate;
+    let blocks = work.blocks;
+    let n = blocks.starts.len() - 1;
+    let (zero, one) = (WideLane::splat(simd, 0.0), WideLane::splat(simd, 1.0));
+    for at in (0..stride).step_by(WIDE) {
+        for i in 0..n {
+            WideLane::load(simd, z, (i * s + s - 1) * stride + at).store(out, i * stride + at);
+            let range = blocks.starts[i]..blocks.starts[i + 1];
+            let entries = &blocks.entries[range.start * s..range.end * s];
+            // Sums of their own for every γ and for every second coordinate hide the latency of the multiply-add.
+            let (mut even, mut odd) = ([zero; N], [zero; N]);
+            for (pair, entries) in blocks.related[range].chunks(2).zip(entries.chunks(2 * s)) {
+                let first = pair[0] as usize * s * stride + at;
+                for k in 0..s {
+                    let from = WideLane::load(simd, z, first + k * stride);
+                    even[k] = WideLane::splat(simd, entries[k]).mul_add(from, even[k]);
                 }
-                let from = WideLane::load(simd, z, (j * s + gamma - 1) * stride + at);
-                sum = WideLane::splat(simd, ahead).mul_add(from, sum);
-                if i != j {
-                    let own = WideLane::load(simd, z, (i * s + gamma - 1) * stride + at);
-                    moved = WideLane::splat(simd, behind).mul_add(own, moved);
+                if let [_, second] = pair {
+                    let second = *second as usize * s * stride + at;
+                    for k in 0..s {
+                        let from = WideLane::load(simd, z, second + k * stride);
+                        odd[k] = WideLane::splat(simd, entries[s + k]).mul_add(from, odd[k]);
+                    }
                 }
             }
-            moved.store(out, target);
+            let mut sum = zero;
+            for k in 0..s {
+                sum = one.mul_add(even[k], one.mul_add(odd[k], sum));
+            }
+            sum.store(out, (n + i) * stride + at);
         }
-        let target = (n + i) * stride + at;
-        WideLane::splat(simd, 1.0).mul_add(sum, WideLane::load(simd, out, target)).store(out, target);
     }
 }
 

@@ -14,7 +14,6 @@ use crate::del_hessian::DelHessian;
 use crate::del_residual::DelWorkspace;
 use crate::dense_lu::DenseNewton;
 use crate::errors::FactorError;
-use crate::lobatto::MAX_UNKNOWN_NODES;
 use crate::recursive_newton::RecursiveNewton;
 use crate::row_matrix::RowMatrix;
 use crate::spatial::{Twist, Wrench};
@@ -128,13 +127,13 @@ pub(crate) enum BaseEntry {
 
 /// Everything in the Newton matrix of a floating tree that is not plainly `H[α,γ]` (module doc of [`crate::del_hessian`]).
 ///
-/// Calls `put(row, column, entry)` in coordinate-major numbering: `Set` for all base-base entries and the joint columns of
+/// Calls `put([coordinate, α], [coordinate, γ - 1], entry)`, row first: `Set` for all base-base entries and the joint columns of
 /// the base rows `α = 0`; `Add` for what comes on top of `H` in the base columns of the joint rows.
 pub(crate) fn jacobian_column_rule(
     tree: &KinematicTree,
     del: &DelWorkspace,
     hessian: &DelHessian,
-    put: &mut dyn FnMut(usize, usize, BaseEntry),
+    mut put: impl FnMut([usize; 2], [usize; 2], BaseEntry),
 ) {
     let s = del.unknown_nodes();
     let start_twists = base_matrix(del, 0);
@@ -145,28 +144,27 @@ pub(crate) fn jacobian_column_rule(
         let dof = tree.joint_dof(i);
         let first_pair = hessian.pair_starts[i];
         for alpha in 0..s {
-            let shift = Vector6::from(hessian.shift_row(dof, alpha)).transpose() * start_twists;
             for k in 0..6 {
-                let change = shift[k] - hessian.entry(first_pair + k, alpha, 0);
-                put(dof * s + alpha, k * s + last, BaseEntry::Add(change));
+                let change = hessian.shift_on_base(dof, k, alpha) - hessian.entry(first_pair + k, alpha, 0);
+                put([dof, alpha], [k, last], BaseEntry::Add(change));
             }
         }
         for gamma in 1..=s {
-            let impulse = Vector6::from(hessian.impulse_column(dof, gamma));
-            let projected = end_twists.tr_mul(&impulse);
             for k in 0..6 {
                 let ahead =
                     hessian.mirrored(first_pair + k, 0, gamma) - hessian.mirrored(first_pair + k, s, gamma);
-                put(k * s, dof * s + gamma - 1, BaseEntry::Set(ahead + projected[k]));
+                put([k, 0], [dof, gamma - 1], BaseEntry::Set(ahead + hessian.impulse_on_base(dof, k, gamma)));
             }
         }
     }
 
     // Change of the total impulse by δξ^s through the rigid shift S^0 δξ^s and through δξ^0 = -δξ^s.
     let mut shifted_impulse = Matrix6::from_fn(|r, k| -hessian.impulse_column(k, 0)[r]);
+    let mut rigid = Matrix6::zeros();
     for alpha in 0..=s {
-        shifted_impulse += base_gain(del, hessian, alpha) * start_twists;
+        rigid += Matrix6::from_fn(|r, k| hessian.rigid_column(k, alpha)[r]);
     }
+    shifted_impulse += rigid * start_twists;
     let momentum_end = {
         let (_, impulse) = del.body_momentum_and_impulse(0, s);
         del.base_momentum_before_end() + impulse
@@ -175,29 +173,24 @@ pub(crate) fn jacobian_column_rule(
     let curved =
         second_order_matrix(del, s, &momentum_end) - second_order_matrix(del, 0, &del.start_momentum());
     let last_column = end_twists.tr_mul(&(shifted_impulse + turned)) + curved;
-    let mut shifts = [Matrix6::zeros(); MAX_UNKNOWN_NODES + 1];
-    for (alpha, shift) in shifts.iter_mut().enumerate().take(s + 1) {
-        *shift = Matrix6::from_fn(|k, c| hessian.shift_row(k, alpha)[c]) * start_twists;
-    }
     for k in 0..6 {
         for l in 0..6 {
             for gamma in 1..=s {
                 for alpha in 1..s {
                     let mut value = hessian.base_entry(k, l, alpha, gamma);
                     if gamma == s {
-                        value += shifts[alpha][(k, l)] - hessian.base_entry(k, l, alpha, 0);
+                        value += hessian.shift_on_base(k, l, alpha) - hessian.base_entry(k, l, alpha, 0);
                     }
-                    put(k * s + alpha, l * s + gamma - 1, BaseEntry::Set(value));
+                    put([k, alpha], [l, gamma - 1], BaseEntry::Set(value));
                 }
-                let impulse = Vector6::from(hessian.impulse_column(l, gamma));
                 let mut value = hessian.base_entry(k, l, 0, gamma) - hessian.base_entry(k, l, s, gamma)
-                    + end_twists.column(k).dot(&impulse);
+                    + hessian.impulse_on_base(l, k, gamma);
                 if gamma == s {
-                    value += last_column[(k, l)] + shifts[0][(k, l)]
-                        - shifts[s][(k, l)]
+                    value += last_column[(k, l)] + hessian.shift_on_base(k, l, 0)
+                        - hessian.shift_on_base(k, l, s)
                         - (hessian.base_entry(k, l, 0, 0) - hessian.base_entry(k, l, s, 0));
                 }
-                put(k * s, l * s + gamma - 1, BaseEntry::Set(value));
+                put([k, 0], [l, gamma - 1], BaseEntry::Set(value));
             }
         }
     }
@@ -205,13 +198,12 @@ pub(crate) fn jacobian_column_rule(
 
 /// `S^α` of the base as a matrix.
 pub(crate) fn base_matrix(del: &DelWorkspace, alpha: usize) -> Matrix6<f64> {
-    // Sᵀ applied to unit wrenches gives its columns' entries row by row.
-    let mut rows = Matrix6::zeros();
-    for r in 0..6 {
-        let unit = Wrench::from_vector(&Vector6::ith(r, 1.0));
-        rows.set_row(r, &Vector6::from(del.project_base(alpha, &unit)).transpose());
-    }
-    rows
+    let (z, p) = del.base_turn_and_position(alpha);
+    let mut twists = Matrix6::zeros();
+    twists.fixed_view_mut::<3, 3>(0, 0).copy_from(&z);
+    twists.fixed_view_mut::<3, 3>(3, 0).copy_from(&(p.cross_matrix() * z));
+    twists.fixed_view_mut::<3, 3>(3, 3).copy_from(&del.center.rotation);
+    twists
 }
 
 /// Matrix of `ad^D_X`.
@@ -221,16 +213,6 @@ fn dual_matrix(x: &Wrench) -> Matrix6<f64> {
         m.set_column(c, &x.dual_bracket(&Twist::from_vector(&Vector6::ith(c, 1.0))).to_vector());
     }
     m
-}
-
-/// `(𝒴 - ad^D_Γ)^α` of the base, times `w_α Δt`.
-fn base_gain(del: &DelWorkspace, hessian: &DelHessian, alpha: usize) -> Matrix6<f64> {
-    // The shift rows hold Sᵀ𝒴 of the base: solve for 𝒴 by the inverse of Sᵀ.
-    let rows = Matrix6::from_fn(|k, c| hessian.shift_row(k, alpha)[c]);
-    let (_, impulse) = del.body_momentum_and_impulse(0, alpha);
-    let twists = base_matrix(del, alpha);
-    let gain = twists.transpose().lu().solve(&rows).unwrap_or_else(Matrix6::zeros);
-    gain - dual_matrix(&impulse)
 }
 
 /// `N^α(X)` of the base as a matrix.

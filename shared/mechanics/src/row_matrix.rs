@@ -11,14 +11,21 @@ pub struct RowMatrix {
     rows: usize,
     columns: usize,
     stride: usize,
+    /// Where the first row starts: on a cache line, so that no register of eight doubles straddles two.
+    first: usize,
     data: Vec<Quad>,
 }
+
+/// Bytes of a cache line.
+const CACHE_LINE: usize = 64;
 
 impl RowMatrix {
     /// A zero matrix.
     pub fn zeros(rows: usize, columns: usize) -> Self {
         let stride = WIDE * columns.div_ceil(WIDE * LANES);
-        Self { rows, columns, stride, data: vec![Quad::ZERO; rows * stride] }
+        let data = vec![Quad::ZERO; rows * stride + 1];
+        let first = data.as_ptr().align_offset(CACHE_LINE).min(1);
+        Self { rows, columns, stride, first, data }
     }
 
     /// Number of rows.
@@ -39,19 +46,19 @@ impl RowMatrix {
     /// Entry `(row, column)`.
     #[inline(always)]
     pub fn get(&self, row: usize, column: usize) -> f64 {
-        self.data[row * self.stride + column / LANES].0[column % LANES]
+        self.data[self.first + row * self.stride + column / LANES].0[column % LANES]
     }
 
     /// Sets entry `(row, column)`.
     #[inline(always)]
     pub fn set(&mut self, row: usize, column: usize, value: f64) {
-        self.data[row * self.stride + column / LANES].0[column % LANES] = value;
+        self.data[self.first + row * self.stride + column / LANES].0[column % LANES] = value;
     }
 
     /// Adds to entry `(row, column)`.
     #[inline(always)]
     pub fn add(&mut self, row: usize, column: usize, value: f64) {
-        self.data[row * self.stride + column / LANES].0[column % LANES] += value;
+        self.data[self.first + row * self.stride + column / LANES].0[column % LANES] += value;
     }
 
     /// Quads per row.
@@ -62,12 +69,12 @@ impl RowMatrix {
 
     #[inline(always)]
     pub(crate) fn quads(&self) -> &[Quad] {
-        &self.data
+        &self.data[self.first..]
     }
 
     #[inline(always)]
     pub(crate) fn quads_mut(&mut self) -> &mut [Quad] {
-        &mut self.data
+        &mut self.data[self.first..]
     }
 
     /// Copies the entries row by row into a plain slice of `rows * columns`.
