@@ -78,8 +78,14 @@ impl HorizonProblem {
         }
         // Without a limit, 100 N·m stands for one.
         let effort = |limit: f64| if limit.is_finite() { limit } else { 100.0 };
-        let torque_weight =
-            model.limits.iter().map(|limit| config.weights.torque / effort(limit.effort).powi(2)).collect();
+        let torque_weight = model
+            .limits
+            .iter()
+            .map(|limit| {
+                let effort = effort(limit.effort);
+                config.weights.torque / (effort * effort)
+            })
+            .collect();
         Ok(Self {
             dynamics: HorizonDynamics::new(tree, lengths.len())?,
             nodes: vec![NodeKinematics::new(tree); lengths.len() + 1],
