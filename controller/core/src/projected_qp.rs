@@ -82,7 +82,7 @@ pub struct ProjectedQpOptions {
 
 impl Default for ProjectedQpOptions {
     fn default() -> Self {
-        Self { capacity: 64, rows_per_round: 24, max_rounds: 8, tolerance: 1e-8, pivots: 12 }
+        Self { capacity: 64, rows_per_round: 24, max_rounds: 8, tolerance: 1e-9, pivots: 12 }
     }
 }
 
