@@ -161,7 +161,7 @@ fn names_limits_contacts_and_soles() {
     assert!(atlas.coordinate_map.is_identity());
     assert_eq!(atlas.warnings, Vec::<String>::new());
     assert_eq!(atlas.contacts.len(), 8);
-    assert_eq!(atlas.shapes.len(), 62);
+    assert_eq!(atlas.shapes.len(), 65);
     assert!(
         atlas
             .shapes
