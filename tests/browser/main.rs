@@ -190,7 +190,17 @@ fn a_person_pulls_at_the_running_robot_and_pauses() {
     let Some(mut browser) = Browser::start("a_person_pulls_at_the_running_robot_and_pauses") else { return };
     let mut run = LiveRun::start(
         "live",
-        &["--set", "clock=lockstep", "--set", "duration_s=600", "--set", "push.impulse_ns=0"],
+        &[
+            "--set",
+            "clock=lockstep",
+            "--set",
+            "duration_s=600",
+            "--set",
+            "push.impulse_ns=0",
+            // It has to be where the page said a moment ago.
+            "--set",
+            "reach.start_s=3600",
+        ],
     );
     let mut page = browser.open(&run.address, [1000, 640], false);
     page.wait_for("frames.rows > 20");
