@@ -342,10 +342,10 @@ impl Controller {
         self.predicted[n..].copy_from_slice(q_dot);
         let mut start_s = (measured_s + self.config.delay_s).max(self.run_time_s(now_ns));
         let ahead_s = self.nominal.start_s;
-        if self.prepared.is_some()
-            && ahead_s >= measured_s
-            && (ahead_s - start_s).abs() <= self.config.servo_period_s
-        {
+        // A tick that was missed makes the state later than prepared for, but a plan that begins at the state is still a plan; doing all
+        // of it again would miss the next tick too.
+        let earliest_s = measured_s - 1e-9;
+        if self.prepared.is_some() && (earliest_s..=start_s + self.config.servo_period_s).contains(&ahead_s) {
             start_s = ahead_s;
         }
         self.predict(measured_s, start_s - measured_s).map_err(|()| reason::PREDICTION)?;
