@@ -161,7 +161,7 @@ mod tests {
 
     impl Controller for Echo {
         fn cycle(&mut self, state: &PlantState, _now_ns: u64, command: &mut Command) {
-            command.torque[0] = state.position[0];
+            command.segments[0].torque[0] = state.position[0];
             command.state_time_ns = state.time_ns;
         }
     }
@@ -180,7 +180,7 @@ mod tests {
             state.time_ns = 1_000 * k;
             let mut command = Command::new(1, 2, 1);
             controller.cycle(&state, 0, &mut command);
-            (command.torque[0], command.state_time_ns)
+            (command.segments[0].torque[0], command.state_time_ns)
         };
         (0..6).map(look).collect()
     }

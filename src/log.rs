@@ -262,6 +262,16 @@ float64[3] stance_torque_b
 float64[3] stance_force_b
 ";
 
+const SEGMENT_FIELDS: &str = "\
+uint64 begin_ns
+float64[32] torque
+float64[32] torque_lower
+float64[32] torque_upper
+float64[32] position_ref
+float64[32] velocity_ref
+float64[32] acceleration_ref
+";
+
 /// The gain is the row-major 32 x 64 matrix.
 const COMMAND_FIELDS: &str = "\
 delmpc_msgs/Header header
@@ -273,12 +283,9 @@ uint32 n_joints
 uint32 verdict
 uint32 fallback_level
 uint32 reason
-float64[32] torque
-float64[32] torque_lower
-float64[32] torque_upper
-float64[32] position_ref
-float64[32] velocity_ref
-float64[32] acceleration_ref
+uint32 n_segments
+uint32 reserved
+delmpc_msgs/Segment[8] segments
 float64[2048] gain
 delmpc_msgs/CycleReport report
 ";
@@ -341,14 +348,16 @@ fn plant_state_schema() -> String {
 }
 
 fn command_schema() -> String {
-    let report = format!("{SEPARATOR}MSG: delmpc_msgs/CycleReport\n{CYCLE_REPORT_FIELDS}");
-    format!("{COMMAND_FIELDS}{SEPARATOR}MSG: delmpc_msgs/Header\n{HEADER_FIELDS}{report}")
+    let parts =
+        [("Header", HEADER_FIELDS), ("Segment", SEGMENT_FIELDS), ("CycleReport", CYCLE_REPORT_FIELDS)];
+    let part = |(name, fields)| format!("{SEPARATOR}MSG: delmpc_msgs/{name}\n{fields}");
+    std::iter::once(COMMAND_FIELDS.to_owned()).chain(parts.map(part)).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use delmpc_messages::{CycleReport, Header};
+    use delmpc_messages::{CycleReport, Header, Segment};
     use std::mem::offset_of;
 
     /// Offset of every field as CDR lays it out, and the size of the whole.
@@ -365,6 +374,7 @@ mod tests {
                 "uint32" => (4, 4),
                 "uint64" | "float64" => (8, 8),
                 "delmpc_msgs/Header" => (layout(HEADER_FIELDS).1, 4),
+                "delmpc_msgs/Segment" => (layout(SEGMENT_FIELDS).1, 8),
                 "delmpc_msgs/CycleReport" => (layout(CYCLE_REPORT_FIELDS).1, 8),
                 other => panic!("{other}"),
             };
@@ -424,15 +434,17 @@ mod tests {
                 verdict,
                 fallback_level,
                 reason,
-                torque,
-                torque_lower,
-                torque_upper,
-                position_ref,
-                velocity_ref,
-                acceleration_ref,
+                n_segments,
+                reserved,
+                segments,
                 gain,
                 report,
             ]
+        );
+        assert_layout!(
+            Segment,
+            SEGMENT_FIELDS,
+            [begin_ns, torque, torque_lower, torque_upper, position_ref, velocity_ref, acceleration_ref,]
         );
         assert_layout!(
             CycleReport,

@@ -12,7 +12,7 @@ use delmpc::setup::{FAULT_SCENARIO, Setup};
 use delmpc::timing::campaign::{Trial, message_trial};
 use delmpc_controller_process::stop::StopFlag;
 use delmpc_messages::FallbackLevel;
-use delmpc_scenario::{FaultKind, FaultSettings, FaultTarget};
+use delmpc_scenario::{FaultKind, FaultSettings, FaultTarget, Scenario};
 
 /// Sooner and shorter than in the file, and still long enough to fall after the longest fault.
 const START_S: f64 = 0.2;
@@ -88,7 +88,7 @@ fn every_fault_of_messages_is_stood_on_the_first_rungs() {
 
 #[test]
 fn a_long_silence_leads_down_the_ladder() {
-    let setup = setup();
+    let setup = Setup { scenario: Scenario { duration_s: 2.0, ..setup().scenario }, ..setup() };
     let silent = |target| FaultSettings { count: 1000, target, start_s: START_S, ..FaultSettings::default() };
     let found = trials(&setup, &[silent(FaultTarget::Command), silent(FaultTarget::State)]);
     let [commands, states] = &found[..] else { panic!("{found:?}") };
@@ -97,6 +97,26 @@ fn a_long_silence_leads_down_the_ladder() {
     assert!(states.fallback_level_max.unwrap() >= FallbackLevel::GravityHold as u32, "{states:?}");
     for trial in &found {
         assert_eq!(trial.non_finite_torques, Some(0), "{trial:?}");
+    }
+}
+
+/// A command carries the plan of the next tenth of a second: it is not held beyond the stage it is right for.
+#[test]
+fn a_reach_and_a_push_are_done_with_two_thirds_of_the_commands_or_the_states_lost() {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/scenarios/atlas_one_foot.toml");
+    let course = "reach.start_s=0.2 reach.hold_s=0.2 reach.return_s=1.0 push.start_s=2.9 duration_s=3.8";
+    let settings: Vec<String> = course.split(' ').map(str::to_owned).collect();
+    let setup = Setup::read(&file, &settings).unwrap();
+    let lost = |target| FaultSettings {
+        target,
+        start_s: START_S,
+        count: 1000,
+        probability: 0.67,
+        must_stand: true,
+        ..FaultSettings::default()
+    };
+    for trial in trials(&setup, &[lost(FaultTarget::Command), lost(FaultTarget::State)]) {
+        assert_eq!((trial.wrong.as_deref(), trial.non_finite_torques), (None, Some(0)), "{trial:?}");
     }
 }
 

@@ -1,12 +1,12 @@
 //! The servo between commands, and the plant's own watchdog.
 //!
-//! The servo applies `u = torque + gain [q - q_ref; q̇ - q̇_ref]` of the latest command at the plant's rate. A dead controller cannot act,
-//! so the plant keeps the fallback ladder too:
+//! The servo applies `u = torque + gain [q - q_ref; q̇ - q̇_ref]` of the latest command at the plant's rate, segment after segment of its
+//! plan when no other command comes. A dead controller cannot act, so the plant keeps the fallback ladder too:
 //!
 //! | level | rule | for |
 //! |---|---|---|
 //! | 0, 1, .. | the command's own level, while it is valid | until `valid_until` |
-//! | 1 | the last command's gains about its reference | `hold_gains` after it ran out |
+//! | 1 | the last command's gains about the end of its reference | `hold_gains` after it ran out |
 //! | 2 | a static law about a posture, where one was given | `static_law` |
 //! | 3 | the last feed-forward torque, stiffness and damping about the last reference | `gravity_hold` |
 //! | 4 | damping only | `damping` |
@@ -15,96 +15,48 @@
 //! Before the first command the static law holds, if there is one; else nothing does. Levels 2 and below are left after a number
 //! of good commands in a row.
 
-use delmpc_messages::{Command, FallbackLevel, MAX_JOINTS, MessageError, Verdict};
+use delmpc_messages::{Command, FallbackLevel, MessageError, Verdict};
 
 use crate::error::{PlantError, require, require_length};
 
-/// `u = torque + gain [q - q_ref(t); q̇ - q̇_ref(t)]` between `lower` and `upper`, with a reference that moves at constant acceleration.
+/// `u = torque + gain [q - q_ref; q̇]`: a law that holds a posture.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AffineLaw {
     /// Feed-forward torque.
     pub torque: Vec<f64>,
-    /// Least torques.
-    pub lower: Vec<f64>,
-    /// Largest torques.
-    pub upper: Vec<f64>,
-    /// Reference positions.
+    /// The posture.
     pub position_ref: Vec<f64>,
-    /// Reference velocities.
-    pub velocity_ref: Vec<f64>,
-    /// Reference accelerations.
-    pub acceleration_ref: Vec<f64>,
     /// Row-major, joints x (2 joints): positions, then velocities.
     pub gain: Vec<f64>,
 }
 
 impl AffineLaw {
-    /// Zero torque at zero, without bounds.
-    pub fn zeros(joints: usize) -> Self {
-        let zero = vec![0.0; joints];
-        Self {
-            torque: zero.clone(),
-            lower: vec![f64::NEG_INFINITY; joints],
-            upper: vec![f64::INFINITY; joints],
-            position_ref: zero.clone(),
-            velocity_ref: zero.clone(),
-            acceleration_ref: zero,
-            gain: vec![0.0; 2 * joints * joints],
-        }
-    }
-
     /// `torque` at the posture `position`, with stiffness (N·m/rad) and damping (N·m·s/rad) per joint.
     pub fn joint_stiffness(torque: &[f64], position: &[f64], stiffness: &[f64], damping: &[f64]) -> Self {
         let n = torque.len();
-        let mut law = Self::zeros(n);
-        law.torque.copy_from_slice(torque);
-        law.position_ref.copy_from_slice(position);
+        let mut gain = vec![0.0; 2 * n * n];
         for i in 0..n {
-            law.gain[i * 2 * n + i] = -stiffness[i];
-            law.gain[i * 2 * n + n + i] = -damping[i];
+            gain[i * 2 * n + i] = -stiffness[i];
+            gain[i * 2 * n + n + i] = -damping[i];
         }
-        law
+        Self { torque: torque.to_vec(), position_ref: position.to_vec(), gain }
     }
 
-    /// The torque at a measured state, `elapsed_s` after the law began. O(n²), no allocation.
-    pub fn torque_into(&self, elapsed_s: f64, position: &[f64], velocity: &[f64], torque: &mut [f64]) {
+    /// The torque at a measured state. O(n²), no allocation.
+    pub fn torque_into(&self, position: &[f64], velocity: &[f64], torque: &mut [f64]) {
         let n = self.torque.len();
         for (i, out) in torque.iter_mut().enumerate() {
             let row = &self.gain[i * 2 * n..(i + 1) * 2 * n];
             let mut sum = self.torque[i];
             for j in 0..n {
-                let (speed, acceleration) = (self.velocity_ref[j], self.acceleration_ref[j]);
-                let way = elapsed_s * (speed + 0.5 * elapsed_s * acceleration);
-                sum += row[j] * (position[j] - self.position_ref[j] - way);
-                sum += row[n + j] * (velocity[j] - speed - elapsed_s * acceleration);
+                sum += row[j] * (position[j] - self.position_ref[j]) + row[n + j] * velocity[j];
             }
-            *out = sum.max(self.lower[i]).min(self.upper[i]);
-        }
-    }
-
-    fn load(&mut self, command: &Command) {
-        let n = self.torque.len();
-        self.torque.copy_from_slice(&command.torque[..n]);
-        self.lower.copy_from_slice(&command.torque_lower[..n]);
-        self.upper.copy_from_slice(&command.torque_upper[..n]);
-        self.position_ref.copy_from_slice(&command.position_ref[..n]);
-        self.velocity_ref.copy_from_slice(&command.velocity_ref[..n]);
-        self.acceleration_ref.copy_from_slice(&command.acceleration_ref[..n]);
-        for (i, row) in self.gain.chunks_exact_mut(2 * n).enumerate() {
-            row[..n].copy_from_slice(&command.gain[i][..n]);
-            row[n..].copy_from_slice(&command.gain[i][MAX_JOINTS..MAX_JOINTS + n]);
+            *out = sum;
         }
     }
 
     fn check(&self, joints: usize) -> Result<(), PlantError> {
-        for list in [
-            &self.torque,
-            &self.lower,
-            &self.upper,
-            &self.position_ref,
-            &self.velocity_ref,
-            &self.acceleration_ref,
-        ] {
+        for list in [&self.torque, &self.position_ref] {
             require_length("static law", list.len(), joints)?;
         }
         require_length("gain of the static law", self.gain.len(), 2 * joints * joints)
@@ -135,7 +87,7 @@ pub struct WatchdogConfig {
 impl Default for WatchdogConfig {
     fn default() -> Self {
         Self {
-            hold_gains: 0.1,
+            hold_gains: 1.0,
             static_law: 0.5,
             gravity_hold: 0.5,
             damping_only: 1.0,
@@ -183,12 +135,9 @@ pub enum CommandRefused {
 
 #[derive(Clone, Debug)]
 struct Slot {
-    law: AffineLaw,
-    sequence: u64,
+    command: Command,
     level: FallbackLevel,
     good: bool,
-    valid_from_ns: u64,
-    valid_until_ns: u64,
 }
 
 /// Servo and watchdog of all joints.
@@ -199,7 +148,7 @@ pub struct Servo {
     config: WatchdogConfig,
     active: Option<usize>,
     pending: Option<usize>,
-    slots: [Slot; 2],
+    slots: Box<[Slot; 2]>,
     level: FallbackLevel,
     worst_level: FallbackLevel,
     good_in_a_row: u32,
@@ -228,14 +177,8 @@ impl Servo {
         if let Some(law) = &config.law {
             law.check(joints)?;
         }
-        let slot = Slot {
-            law: AffineLaw::zeros(joints),
-            sequence: 0,
-            level: FallbackLevel::ZeroTorque,
-            good: false,
-            valid_from_ns: 0,
-            valid_until_ns: 0,
-        };
+        let command = Command::new(0, joint_set_hash, joints as u32);
+        let slot = Slot { command, level: FallbackLevel::ZeroTorque, good: false };
         let level = if config.law.is_some() { FallbackLevel::StaticLqr } else { FallbackLevel::ZeroTorque };
         Ok(Self {
             joints,
@@ -243,7 +186,7 @@ impl Servo {
             config,
             active: None,
             pending: None,
-            slots: [slot.clone(), slot],
+            slots: Box::new([slot.clone(), slot]),
             level,
             worst_level: FallbackLevel::FreshSolution,
             good_in_a_row: 0,
@@ -273,12 +216,9 @@ impl Servo {
             (None, None) => 0,
         };
         let slot = &mut self.slots[at];
-        slot.law.load(command);
-        slot.sequence = command.header.sequence;
+        slot.command = *command;
         slot.level = command.fallback_level().unwrap_or(FallbackLevel::ZeroTorque);
         slot.good = command.verdict() == Some(Verdict::Ok);
-        slot.valid_from_ns = command.valid_from_ns;
-        slot.valid_until_ns = command.valid_until_ns;
         self.good_in_a_row = if slot.good { self.good_in_a_row.saturating_add(1) } else { 0 };
         self.pending = Some(at);
         self.promote(now_ns);
@@ -300,7 +240,7 @@ impl Servo {
 
     fn promote(&mut self, now_ns: u64) {
         if let Some(pending) = self.pending
-            && self.slots[pending].valid_from_ns <= now_ns
+            && self.slots[pending].command.valid_from_ns <= now_ns
         {
             self.active = Some(pending);
             self.pending = None;
@@ -318,15 +258,17 @@ impl Servo {
         match (self.level, slot, &self.config.law) {
             (FallbackLevel::ZeroTorque, None, _) => torque.fill(0.0),
             (level, Some(slot), _) if self.follows(level, now_ns) => {
-                // What ran out goes no farther.
-                let elapsed_ns = now_ns.min(slot.valid_until_ns).saturating_sub(slot.valid_from_ns);
-                slot.law.torque_into(elapsed_ns as f64 * 1e-9, position, velocity, torque);
+                if slot.command.torque_into(now_ns, position, velocity, torque).is_err() {
+                    // Of another number of joints than this servo: no torque is right for it.
+                    torque.fill(0.0);
+                }
             }
-            (FallbackLevel::StaticLqr, _, Some(law)) => law.torque_into(0.0, position, velocity, torque),
+            (FallbackLevel::StaticLqr, _, Some(law)) => law.torque_into(position, velocity, torque),
             (FallbackLevel::GravityHold, Some(slot), _) => {
+                let (last, _) = slot.command.segment_at(slot.command.valid_until_ns);
                 for (i, out) in torque.iter_mut().enumerate() {
-                    *out = slot.law.torque[i]
-                        - self.config.stiffness[i] * (position[i] - slot.law.position_ref[i])
+                    *out = last.torque[i]
+                        - self.config.stiffness[i] * (position[i] - last.position_ref[i])
                         - self.config.damping[i] * velocity[i];
                 }
             }
@@ -341,7 +283,7 @@ impl Servo {
 
     /// Whether the active command's own law is in force.
     fn follows(&self, level: FallbackLevel, now_ns: u64) -> bool {
-        let valid = self.active.is_some_and(|at| now_ns < self.slots[at].valid_until_ns);
+        let valid = self.active.is_some_and(|at| now_ns < self.slots[at].command.valid_until_ns);
         (valid && !self.recovering) || level == FallbackLevel::ShiftedPlan
     }
 
@@ -354,14 +296,15 @@ impl Servo {
             };
         };
         let slot = &self.slots[active];
-        if now_ns < slot.valid_until_ns {
+        let valid_until_ns = slot.command.valid_until_ns;
+        if now_ns < valid_until_ns {
             if self.recovering && self.good_in_a_row < self.config.good_commands {
                 return self.level;
             }
             self.recovering = false;
             return slot.level;
         }
-        let mut left = now_ns.saturating_sub(slot.valid_until_ns) as f64 * 1e-9;
+        let mut left = now_ns.saturating_sub(valid_until_ns) as f64 * 1e-9;
         let rungs = [
             (FallbackLevel::ShiftedPlan, self.config.hold_gains),
             (FallbackLevel::StaticLqr, if self.config.law.is_some() { self.config.static_law } else { 0.0 }),
@@ -397,12 +340,12 @@ impl Servo {
 
     /// Sequence of the command in force, 0 for none.
     pub fn applied_sequence(&self) -> u64 {
-        self.active.map_or(0, |at| self.slots[at].sequence)
+        self.active.map_or(0, |at| self.slots[at].command.header.sequence)
     }
 
     /// Whether the last torque was the watchdog's, not a valid command's.
     pub fn on_watchdog(&self, now_ns: u64) -> bool {
-        self.recovering || self.active.is_none_or(|at| now_ns >= self.slots[at].valid_until_ns)
+        self.recovering || self.active.is_none_or(|at| now_ns >= self.slots[at].command.valid_until_ns)
     }
 
     /// Commands taken and refused so far.
@@ -414,6 +357,7 @@ impl Servo {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use delmpc_messages::MAX_JOINTS;
 
     const MS: u64 = 1_000_000;
 
@@ -423,7 +367,7 @@ mod tests {
         command.valid_from_ns = from;
         command.valid_until_ns = until;
         command.fallback_level = FallbackLevel::FreshSolution as u32;
-        command.torque[0] = torque;
+        command.segments[0].torque[0] = torque;
         command.gain[0][0] = -10.0;
         command.gain[1][MAX_JOINTS + 1] = -2.0;
         command

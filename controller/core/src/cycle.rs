@@ -20,7 +20,7 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use delmpc_mechanics::inverse_dynamics::{InverseDynamicsWorkspace, gravity_force_into};
-use delmpc_messages::{Command, CycleReport, FallbackLevel, PlantState, Verdict};
+use delmpc_messages::{Command, CycleReport, FallbackLevel, LARGEST_EFFORT, PlantState, Verdict};
 use faer::MatRef;
 use nalgebra::Vector3;
 
@@ -108,6 +108,9 @@ pub struct Controller {
     has_plan: bool,
     /// Whether `nominal`, `horizon` and `riccati` are those of a solution to come, and what that took.
     prepared: Option<Preparation>,
+    /// When the last cycle began, by the caller's clock, and how long the last preparation took, ns.
+    cycle_began_ns: u64,
+    preparation_ns: u64,
     /// Time of the first node the present factors belong to, s of the run.
     factors_start_s: f64,
 
@@ -193,6 +196,8 @@ impl Controller {
             plan,
             has_plan: false,
             prepared: None,
+            cycle_began_ns: 0,
+            preparation_ns: 0,
             factors_start_s: 0.0,
             predicted: vec![0.0; 2 * n],
             predicted_for_s: 0.0,
@@ -226,6 +231,7 @@ impl Controller {
     /// backend's.
     pub fn cycle(&mut self, state: &PlantState, now_ns: u64, clock: &dyn Clock) -> &Command {
         let begin = clock.now_ns();
+        self.cycle_began_ns = begin;
         self.command.report = self.blank_report;
         self.command.reason = 0;
         self.command.verdict = Verdict::Ok as u32;
@@ -283,7 +289,10 @@ impl Controller {
         Ok(())
     }
 
-    /// Makes ready for the next measurement, one period after the last: all that does not need it. To be called while waiting.
+    /// Makes ready for the next measurement, all that does not need it. To be called while waiting, with the clock of [`Self::cycle`].
+    ///
+    /// The next measurement is the one at the first whole period after the last that can still be met: on a machine that is too slow
+    /// for the period, a problem that is always late would be thrown away and made again every time.
     ///
     /// Does nothing before the first good cycle. If it fails, or the measurement is of another time, the next cycle does the work.
     pub fn prepare(&mut self, clock: &dyn Clock) {
@@ -292,9 +301,13 @@ impl Controller {
             return;
         }
         let Some(last_ns) = self.last_state_ns else { return };
-        let next_ns = last_ns + to_ns(self.config.period_s);
+        let begin_ns = clock.now_ns();
+        let ready_s = (begin_ns.saturating_sub(self.cycle_began_ns) + self.preparation_ns) as f64 * 1e-9;
+        let periods = libm::ceil(ready_s / self.config.period_s).max(1.0);
+        let next_ns = last_ns + to_ns(periods * self.config.period_s);
         let start_s = self.run_time_s(next_ns) + self.config.delay_s;
         self.prepared = self.prepare_for(start_s, &mut StopWatch::start(clock)).ok();
+        self.preparation_ns = clock.now_ns().saturating_sub(begin_ns);
     }
 
     /// Nominal, linearisation, factors and warm rows of the problem that begins at `start_s`.
@@ -342,10 +355,10 @@ impl Controller {
         self.predicted[n..].copy_from_slice(q_dot);
         let mut start_s = (measured_s + self.config.delay_s).max(self.run_time_s(now_ns));
         let ahead_s = self.nominal.start_s;
-        // A tick that was missed makes the state later than prepared for, but a plan that begins at the state is still a plan; doing all
-        // of it again would miss the next tick too.
-        let earliest_s = measured_s - 1e-9;
-        if self.prepared.is_some() && (earliest_s..=start_s + self.config.servo_period_s).contains(&ahead_s) {
+        // A tick that was missed makes the state later than prepared for, but a plan that begins at the state is still a plan; so is one
+        // that begins a little later than it could. Doing all of it again would miss the next tick too.
+        let (earliest_s, latest_s) = (measured_s - 1e-9, start_s + self.config.period_s + 1e-9);
+        if self.prepared.is_some() && (earliest_s..=latest_s).contains(&ahead_s) {
             start_s = ahead_s;
         }
         self.predict(measured_s, start_s - measured_s).map_err(|()| reason::PREDICTION)?;
@@ -413,7 +426,7 @@ impl Controller {
             x[n..].copy_from_slice(&self.targets.posture_rate);
             if k < self.nominal.values.stages() {
                 let u = self.nominal.values.u_mut(k);
-                u.copy_from_slice(&self.static_law.torque);
+                u.copy_from_slice(&self.static_law.first().torque);
             }
         }
     }
@@ -489,8 +502,14 @@ impl Controller {
         let (coarse, fine) = (stand_still(last)?, stand_still(self.config.period_s)?);
         self.horizon.set_terminal_cost(&coarse.cost_to_go);
         self.static_law.gain.copy_from(&fine.gain);
-        self.static_law.torque.copy_from_slice(&torque);
-        self.static_law.reference.copy_from_slice(&x);
+        let law = self.static_law.restart();
+        law.torque.copy_from_slice(&torque);
+        law.reference.copy_from_slice(&x);
+        for (j, limit) in self.model.limits.iter().enumerate() {
+            let effort = limit.effort.min(LARGEST_EFFORT);
+            (law.lower[j], law.upper[j]) = (-effort, effort);
+        }
+        law.clamp();
         Ok(())
     }
 
@@ -565,6 +584,11 @@ impl Controller {
     /// The model.
     pub fn model(&self) -> &ControllerModel {
         &self.model
+    }
+
+    /// Plant time of a time of the run.
+    fn run_time_ns(&self, time_s: f64) -> u64 {
+        self.origin_ns.unwrap_or(0).saturating_add_signed(libm::round(time_s * 1e9) as i64)
     }
 
     fn run_time_s(&self, time_ns: u64) -> f64 {

@@ -19,7 +19,8 @@ use delmpc_messages::FallbackLevel;
 pub struct FallbackConfig {
     /// Cycles in a row that allow a better level before it is taken.
     pub good_cycles: u32,
-    /// Oldest plan that may be followed, s.
+    /// Oldest plan that may be followed, s. The servo feeds back what it measures itself: a plan is good while nothing new has happened
+    /// to the robot, and mostly better than a law for another posture.
     pub plan_age_s: f64,
     /// Longest time on the static LQR without a usable state, s.
     pub lqr_s: f64,
@@ -31,7 +32,7 @@ pub struct FallbackConfig {
 
 impl Default for FallbackConfig {
     fn default() -> Self {
-        Self { good_cycles: 5, plan_age_s: 0.1, lqr_s: 0.3, hold_s: 1.0, damping_s: 3.0 }
+        Self { good_cycles: 5, plan_age_s: 1.0, lqr_s: 1.3, hold_s: 2.0, damping_s: 4.0 }
     }
 }
 
@@ -147,18 +148,18 @@ mod tests {
     fn every_level_is_reached_in_order_while_no_state_comes() {
         let mut ladder = ladder();
         let seen: std::vec::Vec<FallbackLevel> =
-            [0.01, 0.2, 0.5, 2.0, 10.0].map(|s| ladder.advance(&blind(s))).to_vec();
+            [0.01, 1.1, 1.5, 2.5, 10.0].map(|s| ladder.advance(&blind(s))).to_vec();
         assert_eq!(seen, [ShiftedPlan, StaticLqr, GravityHold, DampingOnly, ZeroTorque]);
     }
 
     #[test]
     fn a_level_is_left_after_enough_good_cycles_in_a_row() {
         let mut ladder = ladder();
-        ladder.advance(&blind(0.5));
+        ladder.advance(&blind(1.5));
         assert_eq!(ladder.level(), GravityHold);
         assert_eq!([0; 2].map(|_| ladder.advance(&SOLVED)), [GravityHold; 2]);
         // A bad cycle in between starts the count again.
-        assert_eq!(ladder.advance(&blind(0.5)), GravityHold);
+        assert_eq!(ladder.advance(&blind(1.5)), GravityHold);
         assert_eq!([0; 3].map(|_| ladder.advance(&SOLVED)), [GravityHold, GravityHold, FreshSolution]);
     }
 

@@ -1,4 +1,4 @@
-//! The feedback law a command carries to the servo: torque, gain, a moving reference, and bounds.
+//! The feedback law a command carries to the servo: a piece of the plan, a gain, and bounds.
 //!
 //! | letter | meaning | unit |
 //! |---|---|---|
@@ -10,12 +10,17 @@
 //! u(t) = clamp(u + K (x - x_ref(t)), u_lower, u_upper)
 //! ```
 //!
-//! (N, N/m and so on for prismatic joints.) Source: own formulation; the gain is that of the Riccati recursion ([`crate::riccati`]).
+//! (N, N/m and so on for prismatic joints.) All but `K` goes by segments, one for a stage of the plan. The first one is meant for the
+//! time up to the next command. The others are for the case that it is late: a torque that is right for a stage of 5 ms, held for 20,
+//! throws the robot up. `K` is that of the first stage throughout.
+//!
+//! Source: own formulation; the gain is that of the Riccati recursion ([`crate::riccati`]). Sending the rest of the plan along against
+//! lost and late commands: D. Quevedo, D. Nešić, *Robust stability of packetized predictive control*, Automatica 48, 2012.
 
 use alloc::vec;
 use alloc::vec::Vec;
 
-use delmpc_messages::{Command, ConstraintKind, MAX_JOINTS};
+use delmpc_messages::{Command, ConstraintKind, MAX_JOINTS, MAX_SEGMENTS};
 use faer::Mat;
 use nalgebra::Vector3;
 
@@ -23,49 +28,114 @@ use crate::horizon_problem::HorizonProblem;
 use crate::kernels::gemv;
 use crate::trajectory::Trajectory;
 
-/// A law the command can carry: `u = torque + gain (x - reference)` between bounds, in the order of the tree. The reference is that of
-/// the moment the law begins, from where it moves at constant acceleration.
+/// One segment of a [`Law`]. The reference is that of the moment it begins, from where it moves at constant acceleration.
 #[derive(Clone, Debug)]
-pub(crate) struct Law {
+pub(crate) struct LawSegment {
+    /// After the law began, s.
+    pub begin_s: f64,
     pub torque: Vec<f64>,
     pub lower: Vec<f64>,
     pub upper: Vec<f64>,
     pub reference: Vec<f64>,
     pub acceleration: Vec<f64>,
-    pub gain: Mat<f64>,
 }
 
-impl Law {
-    pub fn new(n: usize) -> Self {
+impl LawSegment {
+    fn new(n: usize) -> Self {
         let (lower, upper) = (vec![0.0; n], vec![0.0; n]);
         let (reference, acceleration) = (vec![0.0; 2 * n], vec![0.0; n]);
-        Self { torque: vec![0.0; n], lower, upper, reference, acceleration, gain: Mat::zeros(n, 2 * n) }
+        Self { begin_s: 0.0, torque: vec![0.0; n], lower, upper, reference, acceleration }
     }
 
-    /// Copies a law of the same size.
-    pub fn copy_from(&mut self, other: &Self) {
+    fn copy_from(&mut self, other: &Self) {
+        self.begin_s = other.begin_s;
         self.torque.copy_from_slice(&other.torque);
         self.lower.copy_from_slice(&other.lower);
         self.upper.copy_from_slice(&other.upper);
         self.reference.copy_from_slice(&other.reference);
         self.acceleration.copy_from_slice(&other.acceleration);
+    }
+
+    /// Brings the torque between the bounds.
+    pub fn clamp(&mut self) {
+        for ((u, lower), upper) in self.torque.iter_mut().zip(&self.lower).zip(&self.upper) {
+            *u = u.max(*lower).min(*upper);
+        }
+    }
+}
+
+/// A law the command can carry: `u = torque + gain (x - reference)` between bounds, in the order of the tree.
+#[derive(Clone, Debug)]
+pub(crate) struct Law {
+    segments: Vec<LawSegment>,
+    used: usize,
+    pub gain: Mat<f64>,
+}
+
+impl Law {
+    /// Of one segment of zeros.
+    pub fn new(n: usize) -> Self {
+        Self { segments: vec![LawSegment::new(n); MAX_SEGMENTS], used: 1, gain: Mat::zeros(n, 2 * n) }
+    }
+
+    /// Copies a law of the same size.
+    pub fn copy_from(&mut self, other: &Self) {
+        self.used = other.used;
+        for (segment, from) in self.segments.iter_mut().zip(other.segments()) {
+            segment.copy_from(from);
+        }
         self.gain.copy_from(&other.gain);
+    }
+
+    /// The segments in use, in the order of time.
+    pub fn segments(&self) -> &[LawSegment] {
+        &self.segments[..self.used]
+    }
+
+    /// The segments in use, to write.
+    pub fn segments_mut(&mut self) -> &mut [LawSegment] {
+        &mut self.segments[..self.used]
+    }
+
+    /// Leaves the first segment only, and hands it out.
+    pub fn restart(&mut self) -> &mut LawSegment {
+        self.used = 1;
+        self.segments[0].begin_s = 0.0;
+        self.segments[0].acceleration.fill(0.0);
+        &mut self.segments[0]
+    }
+
+    /// The first segment.
+    pub fn first(&self) -> &LawSegment {
+        &self.segments[0]
+    }
+
+    /// One segment more, with what was in it before; `None` when there is no room.
+    pub fn append(&mut self, begin_s: f64) -> Option<&mut LawSegment> {
+        let segment = self.segments.get_mut(self.used)?;
+        self.used += 1;
+        segment.begin_s = begin_s;
+        Some(segment)
     }
 
     /// The torque at the state `x`, `elapsed_s` after the law began.
     pub fn torque_at(&self, elapsed_s: f64, x: &[f64], error: &mut [f64], torque: &mut [f64]) {
-        let n = self.torque.len();
-        for ((e, x), r) in error.iter_mut().zip(x).zip(&self.reference) {
+        // Times are sums of periods: round-off must not decide.
+        let begun = self.segments().iter().take_while(|segment| segment.begin_s <= elapsed_s + 1e-9).last();
+        let segment = begun.unwrap_or(&self.segments[0]);
+        let elapsed_s = (elapsed_s - segment.begin_s).max(0.0);
+        let n = segment.torque.len();
+        for ((e, x), r) in error.iter_mut().zip(x).zip(&segment.reference) {
             *e = x - r;
         }
         for j in 0..n {
-            let change = elapsed_s * self.acceleration[j];
-            error[j] -= elapsed_s * (self.reference[n + j] + 0.5 * change);
+            let change = elapsed_s * segment.acceleration[j];
+            error[j] -= elapsed_s * (segment.reference[n + j] + 0.5 * change);
             error[n + j] -= change;
         }
-        torque.copy_from_slice(&self.torque);
+        torque.copy_from_slice(&segment.torque);
         gemv(torque, faer::Accum::Add, self.gain.as_ref(), error, 1.0);
-        for ((u, lower), upper) in torque.iter_mut().zip(&self.lower).zip(&self.upper) {
+        for ((u, lower), upper) in torque.iter_mut().zip(&segment.lower).zip(&segment.upper) {
             *u = u.max(*lower).min(*upper);
         }
     }
@@ -123,7 +193,7 @@ pub(crate) fn bound_by_pressure_point(
     index: usize,
     solution: &Trajectory,
     force_change: &Vector3<f64>,
-    law: &mut Law,
+    law: &mut LawSegment,
 ) {
     let problem = &horizon.problem;
     let stage = &problem.stages[index];
@@ -162,13 +232,19 @@ pub(crate) fn bound_by_pressure_point(
 /// Writes a law in the order of the messages.
 pub(crate) fn write_law(law: &Law, message_joint: &[usize], command: &mut Command) {
     let n = message_joint.len();
+    command.n_segments = law.segments().len() as u32;
+    for (segment, out) in law.segments().iter().zip(&mut command.segments) {
+        out.begin_ns = libm::round(segment.begin_s * 1e9) as u64;
+        for (i, &joint) in message_joint.iter().enumerate() {
+            out.torque[joint] = segment.torque[i];
+            out.torque_lower[joint] = segment.lower[i];
+            out.torque_upper[joint] = segment.upper[i];
+            out.position_ref[joint] = segment.reference[i];
+            out.velocity_ref[joint] = segment.reference[n + i];
+            out.acceleration_ref[joint] = segment.acceleration[i];
+        }
+    }
     for (i, &joint) in message_joint.iter().enumerate() {
-        command.torque[joint] = law.torque[i];
-        command.torque_lower[joint] = law.lower[i];
-        command.torque_upper[joint] = law.upper[i];
-        command.position_ref[joint] = law.reference[i];
-        command.velocity_ref[joint] = law.reference[n + i];
-        command.acceleration_ref[joint] = law.acceleration[i];
         for (j, &column) in message_joint.iter().enumerate() {
             command.gain[joint][column] = law.gain[(i, j)];
             command.gain[joint][MAX_JOINTS + column] = law.gain[(i, n + j)];
@@ -185,10 +261,10 @@ mod tests {
         let mut history = LawHistory::new(1, 0.015, 0.005);
         let mut law = Law::new(1);
         for k in 0..9 {
-            law.torque[0] = f64::from(k);
+            law.restart().torque[0] = f64::from(k);
             history.push(0.005 * f64::from(k), &law);
         }
-        let at = |time_s: f64| history.at(time_s).1.torque[0];
+        let at = |time_s: f64| history.at(time_s).1.first().torque[0];
         assert_eq!([at(0.0401), at(0.04), at(0.0399), at(0.0351), at(0.0301)], [8.0, 8.0, 7.0, 7.0, 6.0]);
         assert!((history.at(0.0375).0 - 0.0025).abs() < 1e-12);
         // Older than all that are kept: the oldest.
@@ -199,9 +275,47 @@ mod tests {
     fn a_history_that_is_not_full_yet_knows_its_laws() {
         let mut history = LawHistory::new(1, 0.005, 0.005);
         let mut law = Law::new(1);
-        law.torque[0] = 3.0;
+        law.restart().torque[0] = 3.0;
         history.push(1.0, &law);
-        assert_eq!(history.at(0.5).1.torque[0], 3.0);
-        assert_eq!(history.at(1.5).1.torque[0], 3.0);
+        assert_eq!(history.at(0.5).1.first().torque[0], 3.0);
+        assert_eq!(history.at(1.5).1.first().torque[0], 3.0);
+    }
+
+    #[test]
+    fn a_law_goes_by_segments_and_says_the_same_as_its_message() {
+        let n = 2;
+        let mut law = Law::new(n);
+        for k in 0..3 {
+            let segment = match k {
+                0 => law.restart(),
+                _ => law.append(0.01 * f64::from(k)).unwrap(),
+            };
+            segment.torque.fill(1.0 + f64::from(k));
+            segment.lower.fill(-4.0);
+            segment.upper.fill(4.0);
+            for (i, r) in segment.reference.iter_mut().enumerate() {
+                *r = 0.1 * f64::from(k) - 0.2 * i as f64;
+            }
+            segment.acceleration.fill(3.0 - f64::from(k));
+        }
+        for i in 0..n {
+            for j in 0..2 * n {
+                law.gain[(i, j)] = 1.0 + i as f64 - 0.4 * j as f64;
+            }
+        }
+        let mut command = Command::new(1, 2, n as u32);
+        command.valid_until_ns = 100_000_000;
+        write_law(&law, &[1, 0], &mut command);
+        assert_eq!(command.validate(2, n), Ok(()));
+        let (x, mut error, mut torque) = ([0.3, -0.1, 0.2, 0.4], [0.0; 4], [0.0; 2]);
+        for ms in [0, 3, 9, 10, 15, 20, 60] {
+            law.torque_at(1e-3 * f64::from(ms), &x, &mut error, &mut torque);
+            let mut message = [0.0; 2];
+            command.torque_into(1_000_000 * ms as u64, &[x[1], x[0]], &[x[3], x[2]], &mut message).unwrap();
+            let difference = (torque[0] - message[1]).abs() + (torque[1] - message[0]).abs();
+            assert!(difference < 1e-12, "{ms} ms: {torque:?} and {message:?}");
+        }
+        assert!((3..MAX_SEGMENTS).all(|k| law.append(0.1 * k as f64).is_some()));
+        assert!(law.append(9.0).is_none());
     }
 }

@@ -4,6 +4,8 @@
 mod atlas;
 mod random_problem;
 
+use std::cell::Cell;
+
 use atlas::{WeldedPlant, atlas};
 use delmpc_controller_core::cycle::reason;
 use delmpc_controller_core::prelude::*;
@@ -38,16 +40,16 @@ fn bad_states_are_refused_by_name_and_the_ladder_is_climbed_back() {
     assert_eq!(cycle(&|s| s.header.joint_set_hash ^= 1, 11, 0).1, 3);
     assert_eq!(cycle(&|s| s.base_orientation_w = [1.0; 4], 12, 0).1, 7);
     assert_eq!(cycle(&|s| s.time_ns = 1, 13, 0).1, reason::STALE);
-    assert_eq!(cycle(&|_| {}, 30, 60_000_000), (FallbackLevel::StaticLqr, reason::STALE, Verdict::BadState));
-    for k in 31..35 {
+    assert_eq!(cycle(&|_| {}, 230, 60_000_000), (FallbackLevel::StaticLqr, reason::STALE, Verdict::BadState));
+    for k in 231..235 {
         assert_eq!(cycle(&|_| {}, k, 0), (FallbackLevel::StaticLqr, 0, Verdict::Ok));
     }
-    assert_eq!(cycle(&|_| {}, 35, 0), fresh);
+    assert_eq!(cycle(&|_| {}, 235, 0), fresh);
     // A state from the past, though not too old.
-    assert_eq!(cycle(&|s| s.time_ns -= 2 * PERIOD_NS, 36, 0).1, reason::OUT_OF_ORDER);
+    assert_eq!(cycle(&|s| s.time_ns -= 2 * PERIOD_NS, 236, 0).1, reason::OUT_OF_ORDER);
     // One from the future, which must not make the true ones after it look old.
-    assert_eq!(cycle(&|s| s.time_ns += 1_000_000_000, 37, 0).1, reason::AHEAD);
-    assert_eq!(cycle(&|_| {}, 38, 0).1, 0);
+    assert_eq!(cycle(&|s| s.time_ns += 1_000_000_000, 237, 0).1, reason::AHEAD);
+    assert_eq!(cycle(&|_| {}, 238, 0).1, 0);
 }
 
 #[test]
@@ -72,7 +74,7 @@ fn garbage_gives_finite_commands() {
         let command = controller.cycle(&state, state.time_ns, &StoppedClock);
         command.validate(plant.model.joint_set_hash, n).unwrap();
         let limits = plant.model.message_joint.iter().zip(&plant.model.limits);
-        assert!(limits.clone().all(|(&j, limit)| command.torque[j].abs() <= limit.effort));
+        assert!(limits.clone().all(|(&j, limit)| command.segments[0].torque[j].abs() <= limit.effort));
     }
 }
 
@@ -88,10 +90,10 @@ fn the_baseline_is_a_fixed_gain_about_the_posture_and_off_is_off() {
     };
     let lqr = with(ControllerKind::StaticLqr);
     let (joint, home) = (plant.model.message_joint[0], plant.model.posture[0]);
-    assert_eq!(lqr.position_ref[joint], home);
+    assert_eq!(lqr.segments[0].position_ref[joint], home);
     assert!(lqr.gain[joint][joint] < -100.0, "{}", lqr.gain[joint][joint]);
     let off = with(ControllerKind::Off);
-    assert!(off.torque.iter().all(|u| *u == 0.0) && off.gain.iter().flatten().all(|k| *k == 0.0));
+    assert!(off.segments[0].torque.iter().all(|u| *u == 0.0) && off.gain.iter().flatten().all(|k| *k == 0.0));
 }
 
 #[test]
@@ -113,4 +115,56 @@ fn models_and_configurations_that_make_no_sense_are_refused() {
     assert!(refused(&|_, c| c.weights.com[0] = f64::NAN));
     assert!(refused(&|_, c| c.qp.capacity = 0));
     assert!(!refused(&|_, _| {}));
+}
+
+/// A clock that goes on by `step_ns` every time it is looked at.
+#[derive(Default)]
+struct Stepping {
+    step_ns: Cell<u64>,
+    now_ns: Cell<u64>,
+}
+
+impl Clock for Stepping {
+    fn now_ns(&self) -> u64 {
+        self.now_ns.set(self.now_ns.get() + self.step_ns.get());
+        self.now_ns.get()
+    }
+}
+
+#[test]
+fn a_machine_that_is_too_slow_prepares_for_the_tick_it_can_meet() {
+    let atlas = atlas();
+    let good = WeldedPlant::new(&atlas).measure();
+    let mut controller = Controller::new(atlas.controller_model(), ControllerConfig::default()).unwrap();
+    let clock = Stepping::default();
+    // A cycle of a state: whether what was prepared served, and when the command begins.
+    let cycle = |controller: &mut Controller, time_ns: u64| {
+        let mut state = good;
+        state.time_ns = time_ns;
+        let command = controller.cycle(&state, time_ns, &clock);
+        (command.report.linearize_ns > 0, command.valid_from_ns)
+    };
+    let prepare = |controller: &mut Controller, slowness_ns: u64| {
+        clock.step_ns.set(slowness_ns);
+        controller.prepare(&clock);
+        clock.step_ns.set(0);
+    };
+    cycle(&mut controller, 0);
+    // Fast: the next tick.
+    prepare(&mut controller, 100_000);
+    assert_eq!(cycle(&mut controller, PERIOD_NS), (true, 2 * PERIOD_NS));
+    // Suddenly slow: prepared for the next tick, met at the one after it, where the plan of what was prepared begins.
+    prepare(&mut controller, 1_500_000);
+    assert_eq!(cycle(&mut controller, 3 * PERIOD_NS), (true, 4 * PERIOD_NS));
+    // Now known to be slow: prepared for the tick after the next, and met there.
+    prepare(&mut controller, 1_500_000);
+    assert_eq!(cycle(&mut controller, 5 * PERIOD_NS), (true, 6 * PERIOD_NS));
+    // Fast again, and so too early: the command begins when the plan does.
+    prepare(&mut controller, 100_000);
+    assert_eq!(cycle(&mut controller, 6 * PERIOD_NS), (true, 8 * PERIOD_NS));
+    prepare(&mut controller, 100_000);
+    assert_eq!(cycle(&mut controller, 7 * PERIOD_NS), (true, 8 * PERIOD_NS));
+    // Far too late for what was prepared: made again.
+    prepare(&mut controller, 100_000);
+    assert_eq!(cycle(&mut controller, 12 * PERIOD_NS), (false, 13 * PERIOD_NS));
 }

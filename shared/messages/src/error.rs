@@ -106,6 +106,33 @@ pub enum MessageError {
         /// The code.
         value: u32,
     },
+    /// A command without segments, or with more than fit.
+    #[error(
+        "{message}: {found} segments, expected 1 to {capacity}; build both processes from the same source"
+    )]
+    WrongSegmentCount {
+        /// The refused message.
+        message: &'static str,
+        /// Segments in the message.
+        found: usize,
+        /// Segments that fit.
+        capacity: usize,
+    },
+    /// Segments that do not follow each other in time.
+    #[error(
+        "{message}: segment {index} begins after {begin_ns} ns, expected {} {earliest_ns} ns; look at the sender",
+        if *.index == 0 { "exactly" } else { "not before" }
+    )]
+    SegmentOutOfOrder {
+        /// The refused message.
+        message: &'static str,
+        /// The segment.
+        index: usize,
+        /// When it says it begins, after the begin of the command.
+        begin_ns: u64,
+        /// The earliest time it may; for the first one the only time.
+        earliest_ns: u64,
+    },
     /// A command that ends before it begins.
     #[error(
         "{message}: valid from {from_ns} ns until {until_ns} ns, an empty interval; look at the clock of the sender"
@@ -126,7 +153,7 @@ pub enum MessageError {
     EmptyBounds {
         /// The refused message.
         message: &'static str,
-        /// The joint.
+        /// The joint; counts segment by segment.
         index: usize,
         /// The lower bound.
         lower: f64,
@@ -164,6 +191,8 @@ impl MessageError {
             Self::EmptyInterval { .. } => 9,
             Self::WrongLength { .. } => 10,
             Self::EmptyBounds { .. } => 11,
+            Self::WrongSegmentCount { .. } => 12,
+            Self::SegmentOutOfOrder { .. } => 13,
         }
     }
 }

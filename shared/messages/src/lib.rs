@@ -33,7 +33,7 @@ mod heartbeat;
 mod joint_set;
 mod plant_state;
 
-pub use command::{Command, FallbackLevel, Verdict};
+pub use command::{Command, FallbackLevel, MAX_SEGMENTS, Segment, Verdict};
 pub use cycle_report::{ConstraintKind, CycleReport};
 pub use error::MessageError;
 pub use header::{Header, Message};

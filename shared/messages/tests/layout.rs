@@ -3,7 +3,9 @@
 
 use std::mem::{align_of, offset_of, size_of};
 
-use delmpc_messages::{Command, CycleReport, Header, Heartbeat, MAX_JOINTS, Message, PlantState};
+use delmpc_messages::{
+    Command, CycleReport, Header, Heartbeat, MAX_JOINTS, MAX_SEGMENTS, Message, PlantState, Segment,
+};
 
 #[test]
 fn header_v1() {
@@ -42,9 +44,21 @@ fn plant_state_v1() {
 }
 
 #[test]
-fn command_v2() {
-    assert_eq!(Command::VERSION, 2);
-    assert_eq!((size_of::<Command>(), align_of::<Command>()), (18_104, 8));
+fn segment_v1() {
+    assert_eq!((size_of::<Segment>(), align_of::<Segment>()), (1544, 8));
+    assert_eq!(offset_of!(Segment, begin_ns), 0);
+    assert_eq!(offset_of!(Segment, torque), 8);
+    assert_eq!(offset_of!(Segment, torque_lower), 264);
+    assert_eq!(offset_of!(Segment, torque_upper), 520);
+    assert_eq!(offset_of!(Segment, position_ref), 776);
+    assert_eq!(offset_of!(Segment, velocity_ref), 1032);
+    assert_eq!(offset_of!(Segment, acceleration_ref), 1288);
+}
+
+#[test]
+fn command_v3() {
+    assert_eq!((Command::VERSION, MAX_SEGMENTS), (3, 8));
+    assert_eq!((size_of::<Command>(), align_of::<Command>()), (28_928, 8));
     assert_eq!(offset_of!(Command, header), 0);
     assert_eq!(offset_of!(Command, state_sequence), 40);
     assert_eq!(offset_of!(Command, state_time_ns), 48);
@@ -54,14 +68,10 @@ fn command_v2() {
     assert_eq!(offset_of!(Command, verdict), 76);
     assert_eq!(offset_of!(Command, fallback_level), 80);
     assert_eq!(offset_of!(Command, reason), 84);
-    assert_eq!(offset_of!(Command, torque), 88);
-    assert_eq!(offset_of!(Command, torque_lower), 344);
-    assert_eq!(offset_of!(Command, torque_upper), 600);
-    assert_eq!(offset_of!(Command, position_ref), 856);
-    assert_eq!(offset_of!(Command, velocity_ref), 1112);
-    assert_eq!(offset_of!(Command, acceleration_ref), 1368);
-    assert_eq!(offset_of!(Command, gain), 1624);
-    assert_eq!(offset_of!(Command, report), 18_008);
+    assert_eq!(offset_of!(Command, n_segments), 88);
+    assert_eq!(offset_of!(Command, segments), 96);
+    assert_eq!(offset_of!(Command, gain), 12_448);
+    assert_eq!(offset_of!(Command, report), 28_832);
 }
 
 #[test]

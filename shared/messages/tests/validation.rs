@@ -4,7 +4,7 @@
 
 use delmpc_messages::{
     ClockKind, Command, ConstraintKind, FallbackLevel, Heartbeat, MAX_JOINTS, Message, MessageError,
-    PlantState, ProcessState, Role, Verdict, joint_set_hash, status,
+    PlantState, ProcessState, Role, Segment, Verdict, joint_set_hash, status,
 };
 
 const N: usize = 3;
@@ -104,7 +104,7 @@ fn another_joint_count_is_refused_also_beyond_the_capacity() {
 }
 
 type StateField = (&'static str, usize, fn(&mut PlantState) -> &mut [f64]);
-type CommandField = (&'static str, fn(&mut Command) -> &mut [f64]);
+type SegmentField = (&'static str, fn(&mut Segment) -> &mut [f64]);
 
 #[test]
 fn every_number_of_a_state_is_checked_by_name_and_index() {
@@ -131,18 +131,22 @@ fn every_number_of_a_state_is_checked_by_name_and_index() {
 
 #[test]
 fn every_number_of_a_command_is_checked_by_name_and_index() {
-    let fields: [CommandField; 6] = [
-        ("torque", |c| &mut c.torque),
-        ("torque_lower", |c| &mut c.torque_lower),
-        ("torque_upper", |c| &mut c.torque_upper),
-        ("position_ref", |c| &mut c.position_ref),
-        ("velocity_ref", |c| &mut c.velocity_ref),
-        ("acceleration_ref", |c| &mut c.acceleration_ref),
+    let fields: [SegmentField; 6] = [
+        ("torque", |s| &mut s.torque),
+        ("torque_lower", |s| &mut s.torque_lower),
+        ("torque_upper", |s| &mut s.torque_upper),
+        ("position_ref", |s| &mut s.position_ref),
+        ("velocity_ref", |s| &mut s.velocity_ref),
+        ("acceleration_ref", |s| &mut s.acceleration_ref),
     ];
     for (value, kind) in BAD {
         for (name, field) in fields {
-            for index in 0..N {
-                assert_eq!(place(command_error(|c| field(c)[index] = value)), (name, index, kind));
+            for (segment, joint) in [(0, 0), (0, 1), (0, 2), (1, 0), (2, 2)] {
+                let error = command_error(|c| {
+                    (c.n_segments, c.segments[1].begin_ns, c.segments[2].begin_ns) = (3, 5, 6);
+                    field(&mut c.segments[segment])[joint] = value;
+                });
+                assert_eq!(place(error), (name, segment * MAX_JOINTS + joint, kind));
             }
         }
         for (row, column) in [(0, 0), (2, 2), (1, MAX_JOINTS), (2, MAX_JOINTS + 2)] {
@@ -161,7 +165,8 @@ fn unused_entries_are_not_looked_at() {
     assert_eq!(state.validate(HASH, N), Ok(()));
 
     let mut command = command();
-    command.torque[N] = f64::NAN;
+    command.segments[0].torque[N] = f64::NAN;
+    command.segments[1].torque[0] = f64::NAN;
     command.gain[N][0] = f64::NAN;
     command.gain[0][N] = f64::NAN;
     command.gain[0][MAX_JOINTS + N] = f64::NAN;
@@ -243,9 +248,9 @@ fn every_code_reads_back_as_itself_and_the_next_one_is_unknown() {
 #[test]
 fn the_feedback_law_is_feed_forward_plus_gain_times_error() {
     let mut command = command();
-    command.torque[..N].copy_from_slice(&[1.0, 2.0, 3.0]);
-    command.position_ref[..N].copy_from_slice(&[0.1, 0.2, 0.3]);
-    command.velocity_ref[..N].copy_from_slice(&[-1.0, 0.0, 1.0]);
+    command.segments[0].torque[..N].copy_from_slice(&[1.0, 2.0, 3.0]);
+    command.segments[0].position_ref[..N].copy_from_slice(&[0.1, 0.2, 0.3]);
+    command.segments[0].velocity_ref[..N].copy_from_slice(&[-1.0, 0.0, 1.0]);
     command.gain[0][1] = 10.0;
     command.gain[2][MAX_JOINTS] = -4.0;
     let mut torque = [0.0; N];
@@ -254,8 +259,8 @@ fn the_feedback_law_is_feed_forward_plus_gain_times_error() {
 
     // Half a second on the reference has moved, and at the end of its time it stops.
     (command.valid_from_ns, command.valid_until_ns) = (1_000_000_000, 3_000_000_000);
-    command.velocity_ref[1] = 2.0;
-    command.acceleration_ref[..N].copy_from_slice(&[4.0, 8.0, 0.0]);
+    command.segments[0].velocity_ref[1] = 2.0;
+    command.segments[0].acceleration_ref[..N].copy_from_slice(&[4.0, 8.0, 0.0]);
     command.torque_into(1_500_000_000, &[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0], &mut torque).unwrap();
     let moved = 0.5 * 2.0 + 0.125 * 8.0;
     assert_eq!(torque, [1.0 + 10.0 * (0.7 - 0.2 - moved), 2.0, 3.0 - 4.0 * (1.0 - (-1.0) - 0.5 * 4.0)]);
@@ -263,9 +268,52 @@ fn the_feedback_law_is_feed_forward_plus_gain_times_error() {
     command.torque_into(3_000_000_000, &[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0], &mut torque).unwrap();
     command.torque_into(9_000_000_000, &[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0], &mut late).unwrap();
     assert_eq!(torque, late);
-    command.torque_upper[0] = -3.0;
+    command.segments[0].torque_upper[0] = -3.0;
     command.torque_into(0, &[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0], &mut torque).unwrap();
     assert_eq!(torque[0], -3.0);
+}
+
+#[test]
+fn a_later_segment_takes_over_at_its_time_and_the_last_one_holds_to_the_end() {
+    let mut command = command();
+    (command.valid_from_ns, command.valid_until_ns, command.n_segments) = (1_000, 9_000, 3);
+    for (k, begin_ns) in [0, 2_000, 5_000].into_iter().enumerate() {
+        command.segments[k].begin_ns = begin_ns;
+        command.segments[k].torque[0] = k as f64;
+        command.segments[k].position_ref[0] = 10.0 * k as f64;
+        command.segments[k].velocity_ref[0] = 1e9;
+    }
+    command.segments[3].torque[0] = f64::NAN;
+    command.gain[0][0] = 1.0;
+    let at = |time_ns| {
+        let mut torque = [0.0; N];
+        command.torque_into(time_ns, &[0.0; N], &[0.0; N], &mut torque).unwrap();
+        torque[0]
+    };
+    // Feed-forward of the segment, less where its reference has gone since it began.
+    let expected = [(0, 0.0), (2_500, -1_500.0), (2_999, -1_999.0), (3_000, 1.0 - 10.0), (6_000, 2.0 - 20.0)];
+    for (time_ns, torque) in expected.into_iter().chain([(9_000, -18.0 - 3_000.0), (99_000, -18.0 - 3_000.0)])
+    {
+        assert!((at(time_ns) - torque).abs() < 1e-6, "{time_ns} ns: {} instead of {torque}", at(time_ns));
+    }
+    assert_eq!(command.segment_at(4_000).0.begin_ns, 2_000);
+}
+
+#[test]
+fn segments_are_counted_and_in_order() {
+    let error = command_error(|c| c.n_segments = 0);
+    assert!(matches!(error, MessageError::WrongSegmentCount { found: 0, .. }));
+    let error = command_error(|c| c.n_segments = 9);
+    assert_eq!(
+        error.to_string(),
+        "delmpc/Command/v3: 9 segments, expected 1 to 8; build both processes from the same source"
+    );
+    let error = command_error(|c| c.segments[0].begin_ns = 1);
+    assert!(error.to_string().contains("expected exactly 0 ns"), "{error}");
+    let error = command_error(|c| {
+        (c.n_segments, c.segments[1].begin_ns, c.segments[2].begin_ns) = (3, 70, 70);
+    });
+    assert!(error.to_string().contains("segment 2 begins after 70 ns, expected not before 71 ns"), "{error}");
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! How to damage a message.
 
-use delmpc_messages::{Command, MAX_JOINTS, Message, PlantState};
+use delmpc_messages::{Command, MAX_JOINTS, MAX_SEGMENTS, Message, PlantState};
 
 /// A message that [`crate::FaultInjector`] can damage.
 pub trait Corrupt: Message {
@@ -50,13 +50,15 @@ impl Corrupt for Command {
         let n = joints(self.n_joints);
         let row = choice as usize % n.max(1);
         let (position_gain, velocity_gain) = self.gain[row].split_at_mut(MAX_JOINTS);
+        let used = (self.n_segments as usize).clamp(1, MAX_SEGMENTS);
+        let segment = &mut self.segments[(choice >> 32) as usize % used];
         let numbers = [
-            &mut self.torque[..n],
-            &mut self.torque_lower[..n],
-            &mut self.torque_upper[..n],
-            &mut self.position_ref[..n],
-            &mut self.velocity_ref[..n],
-            &mut self.acceleration_ref[..n],
+            &mut segment.torque[..n],
+            &mut segment.torque_lower[..n],
+            &mut segment.torque_upper[..n],
+            &mut segment.position_ref[..n],
+            &mut segment.velocity_ref[..n],
+            &mut segment.acceleration_ref[..n],
             &mut position_gain[..n],
             &mut velocity_gain[..n],
         ];

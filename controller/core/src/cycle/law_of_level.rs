@@ -2,7 +2,7 @@
 //!
 //! | level | torque | gain | reference |
 //! |---|---|---|---|
-//! | fresh solution, shifted plan | of the plan's stage | of the stage | the plan, moving; fresh: within the bounds of the pressure point |
+//! | fresh solution, shifted plan | of the plan's stages, one segment each | of the first stage | the plan, moving; fresh: within the bounds of the pressure point |
 //! | static LQR | that carries the home posture | of the infinite horizon | home posture |
 //! | gravity hold | that carries the present posture | damping | present posture |
 //! | damping only | 0 | damping | |
@@ -14,10 +14,12 @@ use delmpc_messages::{FallbackLevel, LARGEST_EFFORT, PlantState};
 use super::{Controller, to_ns};
 use crate::config::ControllerKind;
 use crate::estimator::Estimate;
-use crate::feedback_law::{bound_by_pressure_point, write_law};
+use crate::feedback_law::{LawSegment, bound_by_pressure_point, write_law};
 
 /// Part of effort over velocity limit that damps a joint on the last rungs.
 const DAMPING_FRACTION: f64 = 0.1;
+/// A stage of which less than this is left is not worth a segment.
+const SHORTEST_SEGMENT_S: f64 = 1e-6;
 /// From the best to the last.
 const LEVELS: [FallbackLevel; 6] = [
     FallbackLevel::FreshSolution,
@@ -32,10 +34,14 @@ impl Controller {
     /// Forms the law of a level and writes it out; a law with a number that is not plausible gives way to the next level.
     pub(super) fn write_command(&mut self, level: FallbackLevel, state: &PlantState, now_ns: u64) {
         let n = self.model.tree.dof();
-        let start_ns = match self.last_state_ns {
+        let mut start_ns = match self.last_state_ns {
             Some(last) => now_ns.max(last + to_ns(self.config.delay_s)),
             None => now_ns,
         };
+        if level == FallbackLevel::FreshSolution && self.config.kind == ControllerKind::Mpc {
+            // A plan that was prepared for a later time begins then; up to there the last command goes on.
+            start_ns = start_ns.max(self.run_time_ns(self.plan.start_s));
+        }
         self.command.state_sequence = self.last_sequence.max(u64::from(self.last_state_ns.is_some()));
         self.command.state_time_ns = self.last_state_ns.unwrap_or(state.time_ns);
         self.command.valid_from_ns = start_ns;
@@ -56,13 +62,6 @@ impl Controller {
 
     /// The law of a level at a time of the run.
     fn form_law(&mut self, level: FallbackLevel, time_s: f64) {
-        let n = self.model.tree.dof();
-        let law = &mut self.law;
-        for (j, limit) in self.model.limits.iter().enumerate() {
-            let effort = limit.effort.min(LARGEST_EFFORT);
-            (law.lower[j], law.upper[j]) = (-effort, effort);
-        }
-        law.acceleration.fill(0.0);
         let effective = match (self.config.kind, level) {
             (ControllerKind::Off, _) => FallbackLevel::ZeroTorque,
             (ControllerKind::StaticLqr, FallbackLevel::FreshSolution | FallbackLevel::ShiftedPlan) => {
@@ -71,55 +70,107 @@ impl Controller {
             _ => level,
         };
         match effective {
-            FallbackLevel::FreshSolution | FallbackLevel::ShiftedPlan => {
-                let stage = self.plan.stage_at(time_s);
-                law.torque.copy_from_slice(self.plan.values.u(stage));
-                // The law holds for a period, over which its reference goes from the plan's rates to the plan's rates.
-                let period_s = self.config.period_s;
-                self.plan.state_at(time_s + period_s, &mut self.scratch[..2 * n]);
-                self.plan.state_at(time_s, &mut law.reference);
-                for j in 0..n {
-                    law.acceleration[j] = (self.scratch[n + j] - law.reference[n + j]) / period_s;
-                }
-                // The factors may be those of a later start already.
-                let factors_stage = self.plan.stage_after(time_s - self.factors_start_s);
-                law.gain.copy_from(self.riccati.gain(factors_stage));
-                if level == FallbackLevel::FreshSolution {
-                    bound_by_pressure_point(&self.horizon, stage, &self.solution, &self.force_change, law);
-                }
-            }
-            FallbackLevel::StaticLqr => {
-                law.torque.copy_from_slice(&self.static_law.torque);
-                law.reference.copy_from_slice(&self.static_law.reference);
-                law.gain.copy_from(&self.static_law.gain);
-            }
+            FallbackLevel::FreshSolution | FallbackLevel::ShiftedPlan => self.form_law_of_plan(level, time_s),
+            FallbackLevel::StaticLqr => self.law.copy_from(&self.static_law),
             FallbackLevel::GravityHold | FallbackLevel::DampingOnly | FallbackLevel::ZeroTorque => {
-                law.torque.fill(0.0);
-                law.reference.fill(0.0);
-                law.gain.fill(0.0);
-                let Estimate { q, .. } = self.estimator.estimate();
-                law.reference[..n].copy_from_slice(q);
-                if effective != FallbackLevel::ZeroTorque {
-                    for (j, limit) in self.model.limits.iter().enumerate() {
-                        let damping = DAMPING_FRACTION * limit.effort / limit.velocity;
-                        law.gain[(j, n + j)] = if damping.is_finite() { -damping } else { -1.0 };
-                    }
-                }
-                if effective == FallbackLevel::GravityHold {
-                    self.scratch[..n].fill(0.0);
-                    let node = &mut self.node;
-                    let held = node.update(&self.model.tree, q, &self.scratch[..n]).and_then(|()| {
-                        let kinematics = node.kinematics();
-                        gravity_force_into(&self.model.tree, kinematics, &mut self.gravity, &mut law.torque)
-                    });
-                    if held.is_err() {
-                        law.torque.fill(0.0);
-                    }
-                }
+                self.form_passive_law(effective);
             }
         }
-        for (j, u) in law.torque.iter_mut().enumerate() {
-            *u = u.max(law.lower[j]).min(law.upper[j]);
+    }
+
+    /// The stages of the plan from a time on, for as long as a command lives.
+    fn form_law_of_plan(&mut self, level: FallbackLevel, time_s: f64) {
+        let n = self.model.tree.dof();
+        let Self { law, plan, .. } = self;
+        let end_s = time_s + self.config.command_life_s;
+        let (first, stages) = (plan.stage_at(time_s), plan.values.stages());
+        let mut from_s = time_s;
+        for stage in first..stages {
+            if stage > first && from_s >= end_s {
+                break;
+            }
+            let mut until_s = plan.start_s + plan.offsets()[stage + 1];
+            if stage + 1 == stages {
+                // What is beyond the plan goes on as it ends.
+                until_s = until_s.max(from_s + self.config.period_s);
+            }
+            let length_s = until_s - from_s;
+            if length_s < SHORTEST_SEGMENT_S {
+                continue;
+            }
+            let segment = match from_s == time_s {
+                true => Some(law.restart()),
+                false => law.append(from_s - time_s),
+            };
+            let Some(segment) = segment else { break };
+            segment.torque.copy_from_slice(plan.values.u(stage));
+            plan.state_at(until_s, &mut self.scratch[..2 * n]);
+            plan.state_at(from_s, &mut segment.reference);
+            for j in 0..n {
+                segment.acceleration[j] = (self.scratch[n + j] - segment.reference[n + j]) / length_s;
+            }
+            from_s = until_s;
         }
+        // The factors may be those of a later start already.
+        law.gain.copy_from(self.riccati.gain(plan.stage_after(time_s - self.factors_start_s)));
+        self.bound_law();
+        if level == FallbackLevel::FreshSolution {
+            self.keep_pressure_point(first);
+        }
+        self.law.segments_mut().iter_mut().for_each(LawSegment::clamp);
+    }
+
+    /// Narrows the bounds of all segments to what the pressure point allows in the first one, in the plan's stage `stage`: what the
+    /// feedback may add to the torque planned now, it may add later.
+    fn keep_pressure_point(&mut self, stage: usize) {
+        let Some((first, later)) = self.law.segments_mut().split_first_mut() else { return };
+        bound_by_pressure_point(&self.horizon, stage, &self.solution, &self.force_change, first);
+        for segment in later {
+            for j in 0..first.torque.len() {
+                let shift = segment.torque[j] - first.torque[j];
+                segment.lower[j] = segment.lower[j].max(first.lower[j] + shift).min(segment.upper[j]);
+                segment.upper[j] = segment.upper[j].min(first.upper[j] + shift).max(segment.lower[j]);
+            }
+        }
+    }
+
+    /// Bounds of all segments: what the joints can.
+    fn bound_law(&mut self) {
+        for segment in self.law.segments_mut() {
+            for (j, limit) in self.model.limits.iter().enumerate() {
+                let effort = limit.effort.min(LARGEST_EFFORT);
+                (segment.lower[j], segment.upper[j]) = (-effort, effort);
+            }
+        }
+    }
+
+    /// A law that needs no plan: gravity torque and damping, damping, nothing.
+    fn form_passive_law(&mut self, level: FallbackLevel) {
+        let n = self.model.tree.dof();
+        let law = self.law.restart();
+        law.torque.fill(0.0);
+        law.reference.fill(0.0);
+        let Estimate { q, .. } = self.estimator.estimate();
+        law.reference[..n].copy_from_slice(q);
+        if level == FallbackLevel::GravityHold {
+            self.scratch[..n].fill(0.0);
+            let node = &mut self.node;
+            let held = node.update(&self.model.tree, q, &self.scratch[..n]).and_then(|()| {
+                let kinematics = node.kinematics();
+                gravity_force_into(&self.model.tree, kinematics, &mut self.gravity, &mut law.torque)
+            });
+            if held.is_err() {
+                law.torque.fill(0.0);
+            }
+        }
+        self.law.gain.fill(0.0);
+        if level != FallbackLevel::ZeroTorque {
+            for (j, limit) in self.model.limits.iter().enumerate() {
+                let damping = DAMPING_FRACTION * limit.effort / limit.velocity;
+                self.law.gain[(j, n + j)] = if damping.is_finite() { -damping } else { -1.0 };
+            }
+        }
+        self.bound_law();
+        self.law.segments_mut().iter_mut().for_each(LawSegment::clamp);
     }
 }
