@@ -97,6 +97,8 @@ pub struct ControllerConfig {
     pub command_life_s: f64,
     /// Time a cycle may take before it is called late, s.
     pub budget_s: f64,
+    /// Time in which the mass centre is moved to where the measured pressure point says it should be, s; 0: never.
+    pub trim_s: f64,
     /// Innovation of the joint rates (root mean square over joints, rad/s) that is called a model mismatch when it lasts.
     pub mismatch_rate: f64,
 }
@@ -118,6 +120,7 @@ impl Default for ControllerConfig {
             max_state_age_s: 0.05,
             command_life_s: 0.1,
             budget_s: 0.005,
+            trim_s: 1.0,
             mismatch_rate: 1.0,
         }
     }
@@ -173,6 +176,7 @@ impl ControllerConfig {
         positive("period", self.period_s)?;
         positive("servo period", self.servo_period_s)?;
         not_negative("delay", self.delay_s)?;
+        not_negative("trim time", self.trim_s)?;
         positive("state age", self.max_state_age_s)?;
         positive("command life", self.command_life_s)?;
         positive("cycle budget", self.budget_s)?;

@@ -24,6 +24,7 @@ use delmpc_messages::{Command, CycleReport, FallbackLevel, LARGEST_EFFORT, Plant
 use faer::MatRef;
 use nalgebra::Vector3;
 
+use crate::balance_trim::BalanceTrim;
 use crate::config::{ControllerConfig, ControllerKind};
 use crate::contact_wrench::{FlatFoot, WrenchCone};
 use crate::dual_qp::QpSolver;
@@ -91,6 +92,7 @@ pub struct Controller {
     estimator: Estimator,
     ladder: FallbackLadder,
     reference: Reference,
+    trim: BalanceTrim,
     targets: TaskTargets,
 
     dynamics: StageDynamics,
@@ -182,7 +184,8 @@ impl Controller {
         let mut controller = Self {
             estimator: Estimator::new(&model),
             ladder: FallbackLadder::new(config.fallback),
-            reference: Reference { home, reach: None },
+            reference: Reference { home, reach: None, com_shift: Vector3::zeros() },
+            trim: BalanceTrim::new(config.trim_s),
             targets: TaskTargets::new(n),
             dynamics: StageDynamics::new(tree)?,
             gravity: InverseDynamicsWorkspace::new(tree),
@@ -339,6 +342,7 @@ impl Controller {
         }
         self.estimator.update(&self.model, state).map_err(|_| reason::ESTIMATOR)?;
         self.origin_ns.get_or_insert(state.time_ns);
+        let since_last_s = self.last_state_ns.map_or(0.0, |last| (state.time_ns - last) as f64 * 1e-9);
         self.last_state_ns = Some(state.time_ns);
         self.last_sequence = state.header.sequence;
 
@@ -349,6 +353,10 @@ impl Controller {
         self.force_change += FORCE_SMOOTHING * (change - self.force_change);
 
         let measured_s = self.run_time_s(state.time_ns);
+        self.reference.com_shift = Vector3::zeros();
+        self.reference.sample(measured_s, &mut self.targets);
+        self.trim.update(&self.targets.com, &Vector3::from(state.stance_torque_b), &measured, since_last_s);
+        self.reference.com_shift = self.trim.shift();
         self.test_innovation(measured_s);
         let Estimate { q, q_dot, .. } = self.estimator.estimate();
         self.predicted[..n].copy_from_slice(q);

@@ -82,6 +82,8 @@ pub struct Reference {
     pub home: PostureGoal,
     /// The reach and the posture it ends in.
     pub reach: Option<(Reach, PostureGoal)>,
+    /// By how much the mass centre is to be elsewhere than the model says, in {0}, m.
+    pub com_shift: Vector3<f64>,
 }
 
 impl Reference {
@@ -93,7 +95,7 @@ impl Reference {
         let Some((reach, goal)) = &self.reach else {
             targets.posture.copy_from_slice(&home.q);
             targets.posture_rate.fill(0.0);
-            targets.com = home.com;
+            targets.com = home.com + self.com_shift;
             targets.com_velocity = Vector3::zeros();
             targets.hand_activity = 0.0;
             return;
@@ -103,7 +105,7 @@ impl Reference {
             targets.posture[i] = from + s * (to - from);
             targets.posture_rate[i] = rate * (to - from);
         }
-        targets.com = home.com + (goal.com - home.com) * s;
+        targets.com = home.com + (goal.com - home.com) * s + self.com_shift;
         targets.com_velocity = (goal.com - home.com) * rate;
         let way = Vector3::from(reach.ball_m) - home.hand;
         targets.hand = home.hand + way * s;
