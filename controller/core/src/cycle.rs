@@ -521,6 +521,29 @@ impl Controller {
         Ok(())
     }
 
+    /// Stands in another posture from now on: solves the infinite-horizon problem there, for the terminal cost and the static law, and
+    /// gives a reach its new end. A new posture far from the old one is gone to in one go; go there in steps. Allocates.
+    ///
+    /// # Errors
+    /// [`ControlError`] for a posture that does not fit the model, or without a law that holds it; the old one stays then.
+    pub fn set_posture(&mut self, posture: &[f64]) -> Result<(), ControlError> {
+        let old = core::mem::replace(&mut self.model.posture, posture.to_vec());
+        let outcome = self.model.check().and_then(|()| self.stand_in_posture());
+        if outcome.is_err() {
+            self.model.posture = old;
+            // It had a law before.
+            self.stand_in_posture()?;
+        }
+        outcome
+    }
+
+    fn stand_in_posture(&mut self) -> Result<(), ControlError> {
+        self.prepared = None;
+        self.reference.home = posture_goal(&self.model, &self.model.posture)?;
+        self.solve_infinite_horizon()?;
+        self.set_reach(self.reference.reach.as_ref().map(|(reach, _)| *reach))
+    }
+
     /// Sets or clears the reach and computes the posture it ends in. Allocates.
     ///
     /// # Errors

@@ -208,3 +208,31 @@ fn it_survives_the_push_of_the_environment() {
     let push = Push { impulse: Vector3::from_row_slice(&impulse), start_s: 0.2 };
     run(&atlas(), config, numbers("SECONDS_RUN", "2.5")[0], Some(push), std::env::var("VERBOSE").is_ok());
 }
+
+/// The law of another posture is that of a controller made for it, and a posture that is none changes nothing.
+#[test]
+fn a_controller_can_be_told_to_stand_otherwise() {
+    let atlas = atlas();
+    let config = ControllerConfig { kind: ControllerKind::StaticLqr, ..ControllerConfig::default() };
+    let state = WeldedPlant::new(&atlas).measure();
+    let mut bent = atlas.controller_model();
+    bent.posture.iter_mut().for_each(|q| *q *= 0.9);
+    let mut law = |controller: &mut Controller, k: u64| {
+        let mut state = state;
+        state.time_ns = 5_000_000 * k;
+        let command = controller.cycle(&state, state.time_ns, &StoppedClock);
+        (command.segments[0], command.gain)
+    };
+    let mut told = Controller::new(atlas.controller_model(), config.clone()).unwrap();
+    let before = law(&mut told, 1);
+    let mut beyond = bent.posture.clone();
+    beyond[3] = f64::NAN;
+    assert!(told.set_posture(&beyond).unwrap_err().to_string().contains("posture is NaN at index 3"));
+    assert!(told.set_posture(&beyond[1..]).is_err());
+    assert_eq!(law(&mut told, 2), before);
+    told.set_posture(&bent.posture).unwrap();
+    let mut made = Controller::new(bent, config).unwrap();
+    let after = law(&mut told, 3);
+    assert_ne!(after, before);
+    assert_eq!(after, law(&mut made, 1));
+}

@@ -297,6 +297,15 @@ fn a_later_segment_takes_over_at_its_time_and_the_last_one_holds_to_the_end() {
         assert!((at(time_ns) - torque).abs() < 1e-6, "{time_ns} ns: {} instead of {torque}", at(time_ns));
     }
     assert_eq!(command.segment_at(4_000).0.begin_ns, 2_000);
+
+    // The reference that stands has no speed either.
+    command.gain[0] = [0.0; 2 * MAX_JOINTS];
+    command.gain[0][MAX_JOINTS] = 1.0;
+    let mut torque = [0.0; N];
+    for (time_ns, expected) in [(8_999, 2.0 - 1e9), (9_000, 2.0)] {
+        command.torque_into(time_ns, &[0.0; N], &[0.0; N], &mut torque).unwrap();
+        assert_eq!(torque[0], expected);
+    }
 }
 
 #[test]
