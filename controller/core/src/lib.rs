@@ -6,14 +6,14 @@
 //!
 //! Each cycle is one real-time iteration: the last plan, shifted in time, is linearised stage by stage with the variational
 //! integrator; the time-varying LQR and a small dual QP over the constraints that matter give the next plan; the command carries
-//! its first torque, gain and reference point. [`cycle::Controller::cycle`] always answers.
+//! its first gain, and torque and reference of its next tenth of a second. [`cycle::Controller::cycle`] always answers.
 //!
 //! Without the default feature `clarabel` the crate is `no_std` and needs `alloc` in constructors only; the QP is then solved by
 //! [`active_set_dual`].
 //!
 //! Reading order: [`model`], [`config`], [`cycle`]; then in the order of the cycle [`estimator`], [`plan`], [`horizon_dynamics`], [`stage_dynamics`],
 //! [`node_kinematics`], [`tasks`], [`mod@reference`], [`contact_wrench`], [`lq_problem`], [`riccati`], [`dare`], [`projected_qp`],
-//! [`dual_qp`], [`fallback`].
+//! [`dual_qp`], [`fallback`]. Files without public items: `feedback_law.rs` (what a command carries), `balance_trim.rs` (wrong masses).
 #![allow(clippy::needless_range_loop)]
 #![cfg_attr(not(feature = "std"), no_std)]
 #![forbid(unsafe_code)]
