@@ -167,10 +167,13 @@ struct Plan {
     blocks: Vec<Block>,
     /// One column with full support: the residual.
     everything: Block,
+    /// Where the columns of `u` and of `(q, q̇)` lie among the blocks, both padded to whole vectors of stages.
+    places: Vec<u32>,
 }
 
 impl Plan {
-    fn new(tree: &KinematicTree, columns: usize) -> Self {
+    /// With blocks of `columns` columns and `count` stages in a vector.
+    fn new(tree: &KinematicTree, columns: usize, count: usize) -> Self {
         let n = tree.dof();
         let mut pair_starts = vec![0];
         for i in 0..n {
@@ -186,7 +189,16 @@ impl Plan {
         depth_first.sort_by(|&a, &b| tree.branch(a as usize).cmp(tree.branch(b as usize)));
         let subtree = |j: usize| &subtrees[subtree_starts[j]..subtree_starts[j + 1]];
         let block = |columns| Block::new(tree, columns, |i| pair_starts[i], subtree);
-        let blocks = columns_in_blocks(&depth_first, columns).into_iter().map(block).collect();
+        let blocks: Vec<Block> = columns_in_blocks(&depth_first, columns).into_iter().map(block).collect();
+        let first_state = n.next_multiple_of(count);
+        let mut places = vec![0; first_state + (2 * n).next_multiple_of(count)];
+        for (at, block) in blocks.iter().enumerate() {
+            for (c, column) in block.columns.iter().enumerate() {
+                let index = column.index(n);
+                let place = if index < n { index } else { index - n + first_state };
+                places[place] = (at * 3 * n * columns + c) as u32;
+            }
+        }
         let everything = block((0..n).map(Column::Position).collect());
         Self {
             tree: tree.clone(),
@@ -194,6 +206,7 @@ impl Plan {
             gravity: (*tree.gravity_w()).into(),
             blocks,
             everything,
+            places,
             pair_starts,
             subtrees,
             subtree_starts,
@@ -367,9 +380,10 @@ impl StageBatch {
         let Some(engine) = Engine::new(tree, stages, instructions) else {
             return refuse(0, "this processor does not have these instructions");
         };
-        let columns = with_work!(&engine, _simd, work => block_columns(work));
+        let (columns, count) =
+            with_work!(&engine, _simd, work => (block_columns(work.count()), work.count()));
         Ok(Self {
-            plan: Plan::new(tree, columns),
+            plan: Plan::new(tree, columns, count),
             engine,
             stages,
             has_end: false,
@@ -655,8 +669,8 @@ impl StageBatch {
 }
 
 /// Columns solved together: as many as the registers hold.
-fn block_columns<M: StageMemory>(_: &Work<M>) -> usize {
-    if M::COUNT == 8 { 6 } else { 3 }
+fn block_columns(count: usize) -> usize {
+    if count == 8 { 6 } else { 3 }
 }
 
 /// Whether the processor has these instructions.
@@ -697,9 +711,11 @@ impl<M: StageMemory> Work<M> {
         let (depth, pairs) = (depths().max().unwrap_or(0), depths().sum());
         // One more lane for the node behind the last stage.
         let vectors = (stages + 1).div_ceil(M::COUNT);
+        let columns = (3 * n).next_multiple_of(block_columns(M::COUNT));
+        let places = n.next_multiple_of(M::COUNT) + (2 * n).next_multiple_of(M::COUNT);
         Self {
             batches: vec![Batch::new(n); vectors],
-            scratch: Scratch::new(n, depth, pairs, if M::COUNT == 8 { 6 } else { 3 }),
+            scratch: Scratch::new(n, depth, pairs, (columns, places)),
             marks: elimination::Marks::default(),
         }
     }
