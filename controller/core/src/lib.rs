@@ -23,6 +23,7 @@ extern crate alloc;
 extern crate std;
 
 pub mod active_set_dual;
+mod adjoint_sweep;
 #[cfg(feature = "clarabel")]
 pub mod clarabel_dual;
 pub mod config;
