@@ -13,7 +13,7 @@
 //! ```
 
 use super::column_plan::{Block, Column};
-use super::memory::{BackwardPanel, Batch, END, ForwardPanel, Scratch};
+use super::memory::{BackwardPanel, Batch, END, ForwardPanel, JOINTS_AT_ONCE, Scratch};
 use super::{Plan, SINGULAR_MASS, TransitionOutput, WEIGHTS};
 use crate::stage_lanes::{StageKernel, StageMemory, StageSimd, Stages, load};
 
@@ -377,13 +377,15 @@ fn write<S: StageSimd, const C: usize>(simd: S, plan: &Plan, work: &mut Columns<
     let n = plan.n;
     let count = S::Memory::COUNT;
     let Scratch { columns, transposed, .. } = &mut *work.scratch;
-    for at in 0..2 * n {
-        let (joint, row) = if at < n { (at, 1) } else { (at - n, 2) };
-        let cells = &columns[(joint * 3 + row) * C..];
-        for (places, turned) in plan.places.chunks_exact(count).zip(transposed.chunks_exact_mut(count)) {
-            simd.transpose(cells, places, turned);
+    let width = plan.places.len();
+    for first in (0..n).step_by(JOINTS_AT_ONCE) {
+        let joints = first..n.min(first + JOINTS_AT_ONCE);
+        for (at, turned) in transposed.chunks_exact_mut(width).enumerate().take(2 * joints.len()) {
+            let cells = &columns[((first + at / 2) * 3 + 1 + at % 2) * C..];
+            for (places, turned) in plan.places.chunks_exact(count).zip(turned.chunks_exact_mut(count)) {
+                simd.transpose(cells, places, turned);
+            }
         }
-        let (by_input, by_state) = transposed.split_at(n.next_multiple_of(count));
         for (lane, stage) in work.stages.clone().enumerate() {
             let rows = work.output.transition(stage);
             let (length, needed) = (rows.values.len(), rows.needed(n));
@@ -391,9 +393,12 @@ fn write<S: StageSimd, const C: usize>(simd: S, plan: &Plan, work: &mut Columns<
                 work.short.get_or_insert((length.min(needed - 1), needed));
                 continue;
             }
-            let row = &mut rows.values[at * rows.row_stride..];
-            gather(lane, by_input, &mut row[..n]);
-            gather(lane, by_state, &mut row[rows.first_state..][..2 * n]);
+            for (at, turned) in transposed.chunks_exact(width).enumerate().take(2 * joints.len()) {
+                let row = &mut rows.values[(first + at / 2 + at % 2 * n) * rows.row_stride..];
+                let (by_input, by_state) = turned.split_at(n.next_multiple_of(count));
+                gather(lane, by_input, &mut row[..n]);
+                gather(lane, by_state, &mut row[rows.first_state..][..2 * n]);
+            }
         }
     }
 }

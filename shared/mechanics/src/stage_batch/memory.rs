@@ -6,6 +6,9 @@ use alloc::vec::Vec;
 use super::NODES;
 use crate::stage_lanes::StageMemory;
 
+/// Joints whose finished rows are turned from vectors of stages to stages at a time: what the first-level cache holds easily.
+pub(crate) const JOINTS_AT_ONCE: usize = 2;
+
 /// One vector of stages: inputs and results.
 #[derive(Clone, Debug)]
 pub(crate) struct Batch<M> {
@@ -121,7 +124,7 @@ pub(crate) struct Scratch<M> {
     pub sides: Vec<[M; 7]>,
     /// Blocks of columns, one after the other, each `[(joint 3 + row) columns + column]`.
     pub columns: Vec<M>,
-    /// One finished row of all columns, stage by stage in squares.
+    /// Finished rows of some joints, all columns, stage by stage in squares.
     pub transposed: Vec<M>,
 }
 
@@ -148,7 +151,7 @@ impl<M: StageMemory> Scratch<M> {
             backward: vec![[M::default(); 7]; pairs],
             sides: vec![[M::default(); 7]; pairs],
             columns: vec![M::default(); 3 * n * columns],
-            transposed: vec![M::default(); places],
+            transposed: vec![M::default(); 2 * JOINTS_AT_ONCE * places],
         }
     }
 }
