@@ -31,6 +31,7 @@ use pulp::Arch;
 
 use crate::eliminate_inputs::{EliminateInputs, Scratch, StageFactors};
 use crate::errors::ControlError;
+use crate::kernels::dot;
 use crate::lq_problem::{LqProblem, LqSize};
 use crate::lq_stage::Layout;
 use crate::panel::{Panel, mirror_diagonal_tiles};
@@ -122,8 +123,7 @@ impl Riccati {
         let factor = &self.factors[stage].input_factor;
         for j in (0..self.size.inputs).rev() {
             let column = &factor.column(j)[..self.size.inputs];
-            let below: f64 = column[j + 1..].iter().zip(&v[j + 1..]).map(|(l, v)| l * v).sum();
-            v[j] = (v[j] - below) / column[j];
+            v[j] = (v[j] - dot(&column[j + 1..], &v[j + 1..])) / column[j];
         }
     }
 

@@ -56,7 +56,7 @@ use crate::spatial::{Momentum, RigidTransform, Twist, Wrench};
 use crate::stage_lanes::{LARGEST_ANGLE, Oct, StageMemory, StageSimd};
 use crate::tree::KinematicTree;
 use column_plan::{Block, Column, columns_in_blocks};
-use memory::{Batch, Scratch};
+use memory::{Batch, Scratch, StartBody};
 
 /// Nodes of a Simpson step.
 const NODES: usize = 3;
@@ -80,6 +80,33 @@ pub struct StageInput<'a> {
     pub force: &'a [f64],
     /// Length of the stage, s.
     pub time_step: f64,
+}
+
+/// One body at the start of a stage, in {0}.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StartKinematics {
+    /// Pose of the link frame.
+    pub link_pose_w: RigidTransform,
+    /// Joint twist `S_j`.
+    pub joint_twist_w: Twist,
+    /// Spatial velocity.
+    pub velocity_w: Twist,
+    /// `∂P/∂q̇_j` of the total momentum about the origin.
+    pub d_momentum_d_rate: Momentum,
+    /// `∂P/∂q_j`.
+    pub d_momentum_d_q: Momentum,
+}
+
+impl Default for StartKinematics {
+    fn default() -> Self {
+        Self {
+            link_pose_w: RigidTransform::identity(),
+            joint_twist_w: Twist::default(),
+            velocity_w: Twist::default(),
+            d_momentum_d_rate: Momentum::default(),
+            d_momentum_d_q: Momentum::default(),
+        }
+    }
 }
 
 /// How far the nodes of a stage are from a solution of the step.
@@ -289,6 +316,7 @@ fn place<M: StageMemory>(batches: &[Batch<M>], stage: usize) -> (&Batch<M>, usiz
     (&batches[stage / M::COUNT], stage % M::COUNT)
 }
 
+#[inline(always)]
 fn read<M: StageMemory, const N: usize>(memory: &[M; N], lane: usize) -> [f64; N] {
     core::array::from_fn(|k| memory[k].lanes()[lane])
 }
@@ -296,6 +324,24 @@ fn read<M: StageMemory, const N: usize>(memory: &[M; N], lane: usize) -> [f64; N
 fn write<M: StageMemory>(memory: &mut [M], lane: usize, values: &[f64]) {
     for (cell, x) in memory.iter_mut().zip(values) {
         cell.lanes_mut()[lane] = *x;
+    }
+}
+
+impl<M: StageMemory> StartBody<M> {
+    #[inline(always)]
+    fn visit(&self, first: usize, com: Vector3<f64>, mut visit: impl FnMut(usize, &StartKinematics)) {
+        for lane in first..M::COUNT {
+            let rotation = Matrix3::from_row_slice(&read(&self.rotation, lane));
+            let position = Vector3::from(read(&self.position, lane));
+            let kinematics = StartKinematics {
+                link_pose_w: RigidTransform { rotation, translation: position - rotation * com },
+                joint_twist_w: Twist::from_vector(&read(&self.twist, lane).into()),
+                velocity_w: Twist::from_vector(&read(&self.velocity, lane).into()),
+                d_momentum_d_rate: Wrench::from_vector(&read(&self.by_rate, lane).into()),
+                d_momentum_d_q: Wrench::from_vector(&read(&self.by_q, lane).into()),
+            };
+            visit(lane - first, &kinematics);
+        }
     }
 }
 
@@ -653,6 +699,14 @@ impl StageBatch {
     /// Spatial velocity of a body at the start of a stage, in {0}.
     pub fn velocity_w(&self, stage: usize, body: usize) -> Twist {
         at_stage!(self, stage, batch, lane => Twist::from_vector(&read(&batch.start[body].velocity, lane).into()))
+    }
+
+    /// Calls `visit` with the kinematics of one body for stage `first` and those behind it in the same vector, and with their distance
+    /// from `first`: what lies together in memory is read together.
+    #[inline]
+    pub fn visit_start(&self, first: usize, body: usize, visit: impl FnMut(usize, &StartKinematics)) {
+        let com = self.plan.tree.bodies()[body].inertia.com;
+        at_stage!(self, first, batch, lane => batch.start[body].visit(lane, com, visit));
     }
 
     fn check_stage(&self, stage: usize, count: usize) -> Result<(), ModelError> {
