@@ -83,7 +83,7 @@ pub struct StageInput<'a> {
 }
 
 /// One body at the start of a stage, in {0}.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StartKinematics {
     /// Pose of the link frame.
     pub link_pose_w: RigidTransform,
@@ -95,18 +95,6 @@ pub struct StartKinematics {
     pub d_momentum_d_rate: Momentum,
     /// `∂P/∂q_j`.
     pub d_momentum_d_q: Momentum,
-}
-
-impl Default for StartKinematics {
-    fn default() -> Self {
-        Self {
-            link_pose_w: RigidTransform::identity(),
-            joint_twist_w: Twist::default(),
-            velocity_w: Twist::default(),
-            d_momentum_d_rate: Momentum::default(),
-            d_momentum_d_q: Momentum::default(),
-        }
-    }
 }
 
 /// How far the nodes of a stage are from a solution of the step.

@@ -159,13 +159,16 @@ fn eliminate_velocity<S: StageSimd>(simd: S, plan: &Plan, scratch: &mut Scratch<
     }
 }
 
+/// Block columns and block rows of all pairs.
+type Panels<'a, M> = (&'a [ForwardPanel<M>], &'a [BackwardPanel<M>]);
+
 /// Solves one block of `C` columns in place.
 #[inline(always)]
 fn solve<S: StageSimd, const C: usize>(
     simd: S,
     plan: &Plan,
     block: &Block,
-    (forward, backward): (&[ForwardPanel<S::Memory>], &[BackwardPanel<S::Memory>]),
+    (forward, backward): Panels<'_, S::Memory>,
     columns: &mut [S::Memory],
 ) {
     let zero = Stages::splat(simd, 0.0);
