@@ -166,14 +166,15 @@ const COMPONENTS: usize = 6;
 /// The wrench of a stage as an affine map of `z = (u, x)`: its outputs.
 #[derive(Clone, Debug)]
 pub struct StageWrench {
-    /// By the state at the end: one state a column.
+    /// By the state at the end and at the start: one state a column.
     at_end: Panel,
+    at_start: Panel,
 }
 
 impl StageWrench {
     /// For `n` joints, which are also the inputs.
     pub fn new(n: usize) -> Self {
-        Self { at_end: Panel::zeros(COMPONENTS, 2 * n) }
+        Self { at_end: Panel::zeros(COMPONENTS, 2 * n), at_start: Panel::zeros(COMPONENTS, 2 * n) }
     }
 
     /// Linearises the mean wrench of a stage of `time_step` (s) from the node `start` to the node `end`, and writes it, torque
@@ -188,18 +189,19 @@ impl StageWrench {
     ) {
         let n = tree.dof();
         let weight = tree.gravity_w() * tree.total_mass();
-        for j in 0..n {
-            let (by_q, by_rate) = derivative(&weight, end, j, time_step, 1.0);
-            self.at_end.column_mut(j)[..COMPONENTS].copy_from_slice(&by_q);
-            self.at_end.column_mut(n + j)[..COMPONENTS].copy_from_slice(&by_rate);
+        for (node, sign, panel) in [(end, 1.0, &mut self.at_end), (start, -1.0, &mut self.at_start)] {
+            for j in 0..n {
+                let (by_q, by_rate) = derivative(&weight, node, j, time_step, sign);
+                panel.column_mut(j)[..COMPONENTS].copy_from_slice(&by_q);
+                panel.column_mut(n + j)[..COMPONENTS].copy_from_slice(&by_rate);
+            }
         }
         stage.set_outputs_through_transition(&self.at_end);
-        for j in 0..n {
-            let (by_q, by_rate) = derivative(&weight, start, j, time_step, -1.0);
-            for row in 0..COMPONENTS {
-                let output = stage.output_mut(row);
-                output.by_state[j] += by_q[row];
-                output.by_state[n + j] += by_rate[row];
+        let columns = self.at_start.entries().chunks_exact(self.at_start.stride());
+        for row in 0..COMPONENTS {
+            let output = stage.output_mut(row);
+            for (target, column) in output.by_state.iter_mut().zip(columns.clone()) {
+                *target += column[row];
             }
         }
         let mean = mean_wrench(tree, start, end, time_step).to_vector();

@@ -10,10 +10,15 @@
 //!
 //! Cost: 1.4 million operations at 60 states and 30 inputs. No allocation. Source: as [`crate::riccati`].
 
+use core::ops::Range;
+
 use pulp::{Simd, WithSimd};
 
 use crate::lq_stage::{Layout, LqStage};
-use crate::panel::{BLOCK, Panel, TILE, Tile, accumulate, mirror, sqrt, store, zero_tile};
+use crate::panel::{
+    BLOCK, Panel, TILE, Tile, Tiled, accumulate, accumulate_columns, fill, mirror_diagonal_tiles, sqrt,
+    zero_tile,
+};
 
 /// What one stage of the recursion leaves behind, beside `P_k`.
 #[derive(Clone, Debug)]
@@ -50,11 +55,11 @@ pub(crate) struct EliminateInputs<'a> {
     pub layout: Layout,
     pub stage: &'a LqStage,
     pub scratch: &'a mut Scratch,
-    /// `P_{k+1}`, full symmetric; below it the row `p_{k+1}'`.
+    /// `P_{k+1}`, lower triangle and tiles of the diagonal; below it the row `p_{k+1}'`.
     pub next: &'a Panel,
     /// `p_{k+1}`.
     pub gradient: &'a [f64],
-    /// `P_k` and `p_k'`, to be written.
+    /// `P_k` and `p_k'`, to be written; the same of it.
     pub cost_to_go: &'a mut Panel,
     pub factors: &'a mut StageFactors,
 }
@@ -64,46 +69,85 @@ impl WithSimd for EliminateInputs<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) -> bool {
-        // As many sums as the registers hold beside the operands: 32 registers of 512 bits, 16 of 256.
-        if S::F64_LANES == BLOCK { self.run::<S, 4>(simd) } else { self.run::<S, 2>(simd) }
+        let Self { stage, next, .. } = self;
+        let (rows, columns) = (0..stage.transition().stride() / S::F64_LANES, 0..next.columns());
+        let matrix = Propagated { transition: stage.transition(), next };
+        fill(simd, &matrix, &mut self.scratch.propagated, rows, columns, false);
+        self.carry_gradient(simd);
+        self.input_columns(simd);
+        if !self.factorise_inputs(simd) {
+            return false;
+        }
+        self.cost_to_go(simd);
+        self.gain(simd);
+        true
+    }
+}
+
+/// `W = [B A d]' P`.
+struct Propagated<'a> {
+    transition: &'a Panel,
+    next: &'a Panel,
+}
+
+impl Tiled for Propagated<'_> {
+    #[inline(always)]
+    fn tile<S: Simd, const R: usize>(&self, simd: S, row: usize, column: usize) -> Tile<S, R> {
+        let Self { transition, next } = *self;
+        let mut tile = zero_tile::<S, R>(simd);
+        // P(column + c, l): left of the tile by its rows, from the tile on by symmetry.
+        accumulate(simd, &mut tile, (transition, row), (next, column), 0..column);
+        accumulate_columns(simd, &mut tile, (transition, row), (next, column), column..next.columns());
+        tile
+    }
+}
+
+/// The columns of `u` of `T' W'`.
+struct InputColumns<'a> {
+    transition: &'a Panel,
+    propagated: &'a Panel,
+}
+
+impl Tiled for InputColumns<'_> {
+    #[inline(always)]
+    fn tile<S: Simd, const R: usize>(&self, simd: S, row: usize, column: usize) -> Tile<S, R> {
+        let Self { transition, propagated } = *self;
+        let mut tile = zero_tile::<S, R>(simd);
+        accumulate(simd, &mut tile, (transition, row), (propagated, column), 0..propagated.columns());
+        tile
+    }
+}
+
+/// `J'J - Y'Y + T_x' W_x'`.
+struct CostToGo<'a> {
+    layout: Layout,
+    stage: &'a LqStage,
+    propagated: &'a Panel,
+    elimination: &'a Panel,
+}
+
+impl Tiled for CostToGo<'_> {
+    #[inline(always)]
+    fn tile<S: Simd, const R: usize>(&self, simd: S, row: usize, column: usize) -> Tile<S, R> {
+        let Self { layout, stage, propagated, elimination } = *self;
+        let first_x = layout.first_state();
+        let (below, beyond) = (row + first_x / S::F64_LANES, column + first_x);
+        let mut tile = zero_tile::<S, R>(simd);
+        accumulate(simd, &mut tile, (elimination, below), (elimination, beyond), 0..layout.inputs);
+        for column in &mut tile {
+            for sum in column {
+                *sum = simd.neg_f64s(*sum);
+            }
+        }
+        let residuals = &stage.cost.residuals;
+        let squares = residuals.panel();
+        accumulate(simd, &mut tile, (squares, row), (squares, column), 0..residuals.len());
+        accumulate(simd, &mut tile, (stage.transition(), below), (propagated, beyond), 0..layout.states);
+        tile
     }
 }
 
 impl EliminateInputs<'_> {
-    #[inline(always)]
-    fn run<S: Simd, const R: usize>(&mut self, simd: S) -> bool {
-        self.propagate::<S, R>(simd);
-        self.carry_gradient(simd);
-        self.input_columns::<S, R>(simd);
-        if !self.factorise_inputs(simd) {
-            return false;
-        }
-        self.cost_to_go::<S, R>(simd);
-        self.gain(simd);
-        true
-    }
-
-    /// `W = [B A d]' P`.
-    #[inline(always)]
-    fn propagate<S: Simd, const R: usize>(&mut self, simd: S) {
-        let (transition, propagated) = (self.stage.transition(), &mut self.scratch.propagated);
-        let rows = transition.stride() / S::F64_LANES;
-        let (depth, next) = (self.layout.states, self.next);
-        for column in (0..depth).step_by(TILE) {
-            let columns = TILE.min(depth - column);
-            for (row, whole) in tiles(0, rows, R) {
-                let operands = ((transition, row), (next, column));
-                if whole {
-                    let tile = product::<S, R>(simd, operands, depth);
-                    store::<S, R>(propagated, &tile, row, column, columns);
-                } else {
-                    let tile = product::<S, 1>(simd, operands, depth);
-                    store::<S, 1>(propagated, &tile, row, column, columns);
-                }
-            }
-        }
-    }
-
     /// `p'[B A d]`.
     #[inline(always)]
     fn carry_gradient<S: Simd>(&mut self, simd: S) {
@@ -121,24 +165,12 @@ impl EliminateInputs<'_> {
 
     /// The columns of `u` of `M`, from the diagonal down.
     #[inline(always)]
-    fn input_columns<S: Simd, const R: usize>(&mut self, simd: S) {
-        let Layout { inputs, states: depth } = self.layout;
+    fn input_columns<S: Simd>(&mut self, simd: S) {
+        let Layout { inputs, .. } = self.layout;
         let transition = self.stage.transition();
         let Scratch { propagated, elimination, carried_gradient } = &mut *self.scratch;
-        let rows = transition.stride() / S::F64_LANES;
-        for column in (0..inputs).step_by(TILE) {
-            let columns = TILE.min(inputs - column);
-            for (row, whole) in tiles(column / S::F64_LANES, rows, R) {
-                let operands = ((transition, row), (&*propagated, column));
-                if whole {
-                    let tile = product::<S, R>(simd, operands, depth);
-                    store::<S, R>(elimination, &tile, row, column, columns);
-                } else {
-                    let tile = product::<S, 1>(simd, operands, depth);
-                    store::<S, 1>(elimination, &tile, row, column, columns);
-                }
-            }
-        }
+        let rows = 0..transition.stride() / S::F64_LANES;
+        fill(simd, &InputColumns { transition, propagated }, elimination, rows, 0..inputs, true);
         let (cost, carried) = (&self.stage.cost, carried_gradient.column(0));
         for u in 0..inputs {
             let entries = elimination.column_mut(u);
@@ -147,58 +179,61 @@ impl EliminateInputs<'_> {
         }
     }
 
-    /// `(L; Y')` in place of the columns of `u`: left-looking Cholesky of the panel.
+    /// `(L; Y')` in place of the columns of `u`: left-looking Cholesky of the panel, a tile of columns at a time.
     #[inline(always)]
     fn factorise_inputs<S: Simd>(&mut self, simd: S) -> bool {
+        let Layout { inputs, .. } = self.layout;
         let panel = &mut self.scratch.elimination;
         let (stride, lanes) = (panel.stride(), S::F64_LANES);
         let registers = stride / lanes;
-        for j in 0..self.layout.inputs {
-            let first = j / lanes;
-            for (row, whole) in tiles(first, registers, 4) {
-                if whole {
-                    subtract_columns::<S, 4>(simd, panel, j, row);
+        for block in (0..inputs).step_by(TILE) {
+            let end = inputs.min(block + TILE);
+            for (row, whole) in tiles(block / lanes, registers, if lanes == BLOCK { 4 } else { 2 }) {
+                if !whole {
+                    subtract_earlier::<S, 1>(simd, panel, block..end, row);
+                } else if lanes == BLOCK {
+                    subtract_earlier::<S, 4>(simd, panel, block..end, row);
                 } else {
-                    subtract_columns::<S, 1>(simd, panel, j, row);
+                    subtract_earlier::<S, 2>(simd, panel, block..end, row);
                 }
             }
-            let pivot = panel.column(j)[j];
-            if !(pivot > 0.0 && pivot.is_finite()) {
-                return false;
-            }
-            let inverse = simd.splat_f64s(1.0 / sqrt(pivot));
-            for entry in &mut panel.registers_mut::<S>()[j * registers + first..(j + 1) * registers] {
-                *entry = simd.mul_f64s(*entry, inverse);
+            for j in block..end {
+                let first = j / lanes;
+                for (row, whole) in tiles(first, registers, 4) {
+                    if whole {
+                        subtract_columns::<S, 4>(simd, panel, block..j, row);
+                    } else {
+                        subtract_columns::<S, 1>(simd, panel, block..j, row);
+                    }
+                }
+                let pivot = panel.column(j)[j];
+                if !(pivot > 0.0 && pivot.is_finite()) {
+                    return false;
+                }
+                let inverse = simd.splat_f64s(1.0 / sqrt(pivot));
+                for entry in &mut panel.registers_mut::<S>()[j * registers + first..(j + 1) * registers] {
+                    *entry = simd.mul_f64s(*entry, inverse);
+                }
             }
         }
         // Above the diagonal the panel holds what the tiles left there.
-        for j in 0..self.layout.inputs {
+        for j in 0..inputs {
             let column = self.factors.input_factor.column_mut(j);
-            for (row, (entry, from)) in column.iter_mut().zip(panel.column(j)).enumerate() {
-                *entry = if row < j { 0.0 } else { *from };
-            }
+            column[..j].fill(0.0);
+            column[j..].copy_from_slice(&panel.column(j)[j..self.layout.first_state()]);
         }
         true
     }
 
-    /// `P_k = D + J'J - Y'Y + T_x' W_x'`, lower triangle, then mirrored; below it `p_k'`.
+    /// `P_k = D + J'J - Y'Y + T_x' W_x'`, lower triangle and tiles of the diagonal; below it `p_k'`.
     #[inline(always)]
-    fn cost_to_go<S: Simd, const R: usize>(&mut self, simd: S) {
+    fn cost_to_go<S: Simd>(&mut self, simd: S) {
         let Layout { states, .. } = self.layout;
-        let rows = self.cost_to_go.stride() / S::F64_LANES;
-        for column in (0..states).step_by(TILE) {
-            let columns = TILE.min(states - column);
-            for (row, whole) in tiles(column / S::F64_LANES, rows, R) {
-                if whole {
-                    let tile = self.cost_to_go_tile::<S, R>(simd, row, column);
-                    store::<S, R>(self.cost_to_go, &tile, row, column, columns);
-                } else {
-                    let tile = self.cost_to_go_tile::<S, 1>(simd, row, column);
-                    store::<S, 1>(self.cost_to_go, &tile, row, column, columns);
-                }
-            }
-        }
-        let (cost, carried) = (&self.stage.cost, self.scratch.carried_gradient.column(0));
+        let Scratch { propagated, elimination, carried_gradient } = &*self.scratch;
+        let matrix = CostToGo { layout: self.layout, stage: self.stage, propagated, elimination };
+        let rows = 0..self.cost_to_go.stride() / S::F64_LANES;
+        fill(simd, &matrix, self.cost_to_go, rows, 0..states, true);
+        let (cost, carried) = (&self.stage.cost, carried_gradient.column(0));
         let first_x = self.layout.first_state();
         for x in 0..states {
             let entries = self.cost_to_go.column_mut(x);
@@ -206,42 +241,39 @@ impl EliminateInputs<'_> {
             entries[states] += cost.state_gradient[x] + carried[first_x + x];
         }
         let stride = self.cost_to_go.stride();
-        mirror(self.cost_to_go.entries_mut(), stride, states);
+        mirror_diagonal_tiles(self.cost_to_go.entries_mut(), stride, states);
     }
 
-    #[inline(always)]
-    fn cost_to_go_tile<S: Simd, const R: usize>(&self, simd: S, row: usize, column: usize) -> Tile<S, R> {
-        let Layout { inputs, states } = self.layout;
-        let first_x = self.layout.first_state();
-        let shift = first_x / S::F64_LANES;
-        let Scratch { propagated, elimination, .. } = &*self.scratch;
-        let residuals = &self.stage.cost.residuals;
-        let squares = residuals.panel();
-        let eliminated = ((elimination, row + shift), (elimination, column + first_x));
-        let mut tile = product::<S, R>(simd, eliminated, inputs);
-        tile.iter_mut().flatten().for_each(|sum| *sum = simd.neg_f64s(*sum));
-        accumulate(simd, &mut tile, (squares, row), (squares, column), residuals.len());
-        let carried = ((self.stage.transition(), row + shift), (propagated, column + first_x));
-        accumulate(simd, &mut tile, carried.0, carried.1, states);
-        tile
-    }
-
-    /// `K' = -Y' L⁻¹`, from the last column to the first.
+    /// `K' = -Y' L⁻¹`, from the last tile of columns to the first.
     #[inline(always)]
     fn gain<S: Simd>(&mut self, simd: S) {
         let Layout { inputs, .. } = self.layout;
         let first_x = self.layout.first_state();
         let StageFactors { gain, input_factor } = &mut *self.factors;
-        let registers = gain.stride() / S::F64_LANES;
-        for j in (0..inputs).rev() {
-            let factor = input_factor.column(j);
-            let target = gain.column_mut(j);
-            target.copy_from_slice(&self.scratch.elimination.column(j)[first_x..]);
-            for (row, whole) in tiles(0, registers, 4) {
-                if whole {
-                    eliminate_later::<S, 4>(simd, gain, factor, (j, inputs), row);
+        let lanes = S::F64_LANES;
+        let registers = gain.stride() / lanes;
+        for j in 0..inputs {
+            gain.column_mut(j).copy_from_slice(&self.scratch.elimination.column(j)[first_x..]);
+        }
+        for block in (0..inputs).step_by(TILE).rev() {
+            let end = inputs.min(block + TILE);
+            for (row, whole) in tiles(0, registers, if lanes == BLOCK { 4 } else { 2 }) {
+                if !whole {
+                    add_later::<S, 1>(simd, gain, input_factor, block..end, row);
+                } else if lanes == BLOCK {
+                    add_later::<S, 4>(simd, gain, input_factor, block..end, row);
                 } else {
-                    eliminate_later::<S, 1>(simd, gain, factor, (j, inputs), row);
+                    add_later::<S, 2>(simd, gain, input_factor, block..end, row);
+                }
+            }
+            for j in (block..end).rev() {
+                let factor = input_factor.column(j);
+                for (row, whole) in tiles(0, registers, 4) {
+                    if whole {
+                        eliminate_later::<S, 4>(simd, gain, factor, j..end, row);
+                    } else {
+                        eliminate_later::<S, 1>(simd, gain, factor, j..end, row);
+                    }
                 }
             }
         }
@@ -277,16 +309,6 @@ impl Iterator for Tiles {
     }
 }
 
-/// A panel and where in it to begin, twice.
-type Operands<'a> = ((&'a Panel, usize), (&'a Panel, usize));
-
-#[inline(always)]
-fn product<S: Simd, const R: usize>(simd: S, (a, b): Operands<'_>, depth: usize) -> Tile<S, R> {
-    let mut tile = zero_tile::<S, R>(simd);
-    accumulate(simd, &mut tile, a, b, depth);
-    tile
-}
-
 /// `out = matrix vector` in `R` registers from `row` on.
 #[inline(always)]
 fn times_vector<S: Simd, const R: usize>(
@@ -307,15 +329,30 @@ fn times_vector<S: Simd, const R: usize>(
     out.registers_mut::<S>()[row..row + R].copy_from_slice(&sums);
 }
 
-/// `column_j -= Σ_{i<j} column_i L(j, i)` in `R` registers from `row` on.
+/// `column_j -= Σ_i column_i L(j, i)`, i before the tile of columns that j is one of, in `R` registers from `row` on.
 #[inline(always)]
-fn subtract_columns<S: Simd, const R: usize>(simd: S, panel: &mut Panel, j: usize, row: usize) {
+fn subtract_earlier<S: Simd, const R: usize>(simd: S, panel: &mut Panel, block: Range<usize>, row: usize) {
+    let height = panel.stride() / S::F64_LANES;
+    let mut tile = zero_tile::<S, R>(simd);
+    accumulate(simd, &mut tile, (panel, row), (panel, block.start), 0..block.start);
+    let registers = panel.registers_mut::<S>();
+    for (j, sums) in block.zip(&tile) {
+        let target = &mut registers[j * height + row..][..R];
+        for r in 0..R {
+            target[r] = simd.sub_f64s(target[r], sums[r]);
+        }
+    }
+}
+
+/// `column_j -= Σ_i column_i L(j, i)`, j the end of the range of i, in `R` registers from `row` on.
+#[inline(always)]
+fn subtract_columns<S: Simd, const R: usize>(simd: S, panel: &mut Panel, before: Range<usize>, row: usize) {
     let (stride, lanes) = (panel.stride(), S::F64_LANES);
-    let height = stride / lanes;
+    let (height, j) = (stride / lanes, before.end);
     let mut sums = [simd.splat_f64s(0.0); R];
     {
         let (registers, entries) = (panel.registers::<S>(), panel.entries());
-        for i in 0..j {
+        for i in before {
             let factor = simd.splat_f64s(entries[i * stride + j]);
             let source = &registers[i * height + row..][..R];
             for r in 0..R {
@@ -329,20 +366,42 @@ fn subtract_columns<S: Simd, const R: usize>(simd: S, panel: &mut Panel, j: usiz
     }
 }
 
-/// `X_j = -(X_j + Σ_{j<i<end} X_i L(i, j)) / L(j, j)` in `R` registers from `row` on.
+/// `X_j += Σ_i X_i L(i, j)`, i behind the tile of columns that j is one of, in `R` registers from `row` on.
+#[inline(always)]
+fn add_later<S: Simd, const R: usize>(
+    simd: S,
+    panel: &mut Panel,
+    factor: &Panel,
+    block: Range<usize>,
+    row: usize,
+) {
+    let height = panel.stride() / S::F64_LANES;
+    let mut tile = zero_tile::<S, R>(simd);
+    accumulate_columns(simd, &mut tile, (panel, row), (factor, block.start), block.end..factor.columns());
+    let registers = panel.registers_mut::<S>();
+    for (j, sums) in block.zip(&tile) {
+        let target = &mut registers[j * height + row..][..R];
+        for r in 0..R {
+            target[r] = simd.add_f64s(target[r], sums[r]);
+        }
+    }
+}
+
+/// `X_j = -(X_j + Σ_i X_i L(i, j)) / L(j, j)`, j the first of the range and i the others, in `R` registers from `row` on.
 #[inline(always)]
 fn eliminate_later<S: Simd, const R: usize>(
     simd: S,
     panel: &mut Panel,
     factor: &[f64],
-    (j, end): (usize, usize),
+    range: Range<usize>,
     row: usize,
 ) {
     let height = panel.stride() / S::F64_LANES;
+    let j = range.start;
     let registers = panel.registers_mut::<S>();
     let mut sums = [simd.splat_f64s(0.0); R];
     sums.copy_from_slice(&registers[j * height + row..][..R]);
-    for i in j + 1..end {
+    for i in j + 1..range.end {
         let weight = simd.splat_f64s(factor[i]);
         let source = &registers[i * height + row..][..R];
         for r in 0..R {

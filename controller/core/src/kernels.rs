@@ -30,6 +30,19 @@ pub(crate) fn gemv(out: &mut [f64], beta: Accum, matrix: MatRef<'_, f64>, x: &[f
     );
 }
 
+/// `a · b`, in four sums so that additions need not wait for each other.
+pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
+    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<4>(), b.as_chunks::<4>());
+    let mut sums = [0.0; 4];
+    for (a, b) in a.iter().zip(b) {
+        for (sum, (a, b)) in sums.iter_mut().zip(a.iter().zip(b)) {
+            *sum += a * b;
+        }
+    }
+    let rest: f64 = a_rest.iter().zip(b_rest).map(|(a, b)| a * b).sum();
+    (sums[0] + sums[1]) + (sums[2] + sums[3]) + rest
+}
+
 /// Largest magnitude; NaN counts as infinite.
 pub(crate) fn largest(values: &[f64]) -> f64 {
     values.iter().fold(0.0, |m, x| if x.is_nan() { f64::INFINITY } else { m.max(x.abs()) })

@@ -23,6 +23,7 @@ extern crate alloc;
 extern crate std;
 
 pub mod active_set_dual;
+mod adjoint_sweep;
 mod balance_trim;
 #[cfg(feature = "clarabel")]
 pub mod clarabel_dual;

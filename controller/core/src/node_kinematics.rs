@@ -21,7 +21,7 @@ use alloc::vec::Vec;
 use delmpc_mechanics::errors::ModelError;
 use delmpc_mechanics::kinematics::{Configuration, Kinematics, Velocity};
 use delmpc_mechanics::spatial::{Momentum, RigidTransform, SpatialInertia, Twist};
-use delmpc_mechanics::stage_batch::StageBatch;
+use delmpc_mechanics::stage_batch::{StageBatch, StartKinematics};
 use delmpc_mechanics::tree::KinematicTree;
 use nalgebra::Vector3;
 
@@ -29,16 +29,13 @@ use nalgebra::Vector3;
 #[derive(Clone, Debug)]
 pub struct NodeKinematics {
     kinematics: Kinematics,
-    link_pose_w: Vec<RigidTransform>,
-    joint_twist_w: Vec<Twist>,
-    velocity_w: Vec<Twist>,
+    /// Together per body, as they are written and read.
+    bodies: Vec<StartKinematics>,
     composite: Vec<SpatialInertia>,
     subtree_momentum: Vec<Momentum>,
-    d_momentum_d_rate: Vec<Momentum>,
-    d_momentum_d_q: Vec<Momentum>,
     momentum: Momentum,
     com: Vector3<f64>,
-    mass: f64,
+    per_mass: f64,
 }
 
 impl NodeKinematics {
@@ -47,16 +44,12 @@ impl NodeKinematics {
         let n = tree.body_count();
         Self {
             kinematics: Kinematics::new(tree),
-            link_pose_w: vec![RigidTransform::identity(); n],
-            joint_twist_w: vec![Twist::default(); n],
-            velocity_w: vec![Twist::default(); n],
+            bodies: vec![StartKinematics::default(); n],
             composite: vec![SpatialInertia::default(); n],
             subtree_momentum: vec![Momentum::default(); n],
-            d_momentum_d_rate: vec![Momentum::default(); n],
-            d_momentum_d_q: vec![Momentum::default(); n],
             momentum: Momentum::default(),
             com: Vector3::zeros(),
-            mass: tree.total_mass(),
+            per_mass: 1.0 / tree.total_mass(),
         }
     }
 
@@ -83,13 +76,15 @@ impl NodeKinematics {
             }
             let twist = self.kinematics.joint_twists_w()[i];
             let twist_rate = self.kinematics.velocities_w()[i].bracket(&twist);
-            self.d_momentum_d_rate[i] = inertia.mul_twist(&twist);
-            self.d_momentum_d_q[i] = inertia.mul_twist(&twist_rate) - momentum.dual_bracket(&twist);
+            self.bodies[i] = StartKinematics {
+                link_pose_w: self.kinematics.link_poses_w()[i],
+                joint_twist_w: twist,
+                velocity_w: self.kinematics.velocities_w()[i],
+                d_momentum_d_rate: inertia.mul_twist(&twist),
+                d_momentum_d_q: inertia.mul_twist(&twist_rate) - momentum.dual_bracket(&twist),
+            };
         }
         self.com = self.kinematics.mass_centre_of_tree_w(tree);
-        self.link_pose_w.copy_from_slice(self.kinematics.link_poses_w());
-        self.joint_twist_w.copy_from_slice(self.kinematics.joint_twists_w());
-        self.velocity_w.copy_from_slice(self.kinematics.velocities_w());
         Ok(())
     }
 
@@ -101,14 +96,11 @@ impl NodeKinematics {
         for (vector, nodes) in nodes.chunks_mut(together).enumerate() {
             let first = vector * together;
             for body in 0..batch.dof() {
-                for (lane, node) in nodes.iter_mut().enumerate() {
-                    let stage = first + lane;
-                    node.link_pose_w[body] = batch.link_pose_w(stage, body);
-                    node.joint_twist_w[body] = batch.joint_twist_w(stage, body);
-                    node.velocity_w[body] = batch.velocity_w(stage, body);
-                    node.d_momentum_d_rate[body] = batch.d_momentum_d_rate(stage, body);
-                    node.d_momentum_d_q[body] = batch.d_momentum_d_q(stage, body);
-                }
+                batch.visit_start(first, body, |lane, start| {
+                    if let Some(node) = nodes.get_mut(lane) {
+                        node.bodies[body] = *start;
+                    }
+                });
             }
             for (lane, node) in nodes.iter_mut().enumerate() {
                 node.momentum = batch.momentum_w(first + lane);
@@ -124,12 +116,12 @@ impl NodeKinematics {
 
     /// Pose of a body's link frame in {0}.
     pub fn link_pose_w(&self, body: usize) -> &RigidTransform {
-        &self.link_pose_w[body]
+        &self.bodies[body].link_pose_w
     }
 
     /// Joint twist `S_j` in {0}.
     pub fn joint_twist_w(&self, joint: usize) -> &Twist {
-        &self.joint_twist_w[joint]
+        &self.bodies[joint].joint_twist_w
     }
 
     /// Total momentum about the origin of {0}.
@@ -139,12 +131,12 @@ impl NodeKinematics {
 
     /// `∂P/∂q̇_j`.
     pub fn d_momentum_d_rate(&self, joint: usize) -> Momentum {
-        self.d_momentum_d_rate[joint]
+        self.bodies[joint].d_momentum_d_rate
     }
 
     /// `∂P/∂q_j`.
     pub fn d_momentum_d_q(&self, joint: usize) -> Momentum {
-        self.d_momentum_d_q[joint]
+        self.bodies[joint].d_momentum_d_q
     }
 
     /// Mass centre, mass welded to the ground included, m.
@@ -154,22 +146,22 @@ impl NodeKinematics {
 
     /// Velocity of the mass centre, m/s.
     pub fn com_velocity(&self) -> Vector3<f64> {
-        self.momentum.force / self.mass
+        self.momentum.force * self.per_mass
     }
 
     /// `∂c/∂q_j`.
     pub fn d_com_d_q(&self, joint: usize) -> Vector3<f64> {
-        self.d_momentum_d_rate[joint].force / self.mass
+        self.bodies[joint].d_momentum_d_rate.force * self.per_mass
     }
 
     /// `∂ċ/∂q_j`.
     pub fn d_com_velocity_d_q(&self, joint: usize) -> Vector3<f64> {
-        self.d_momentum_d_q[joint].force / self.mass
+        self.bodies[joint].d_momentum_d_q.force * self.per_mass
     }
 
     /// Position in {0} and velocity of a point of a body (link frame).
     pub fn point(&self, body: usize, point: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
-        let (pose, twist) = (&self.link_pose_w[body], &self.velocity_w[body]);
+        let (pose, twist) = (&self.bodies[body].link_pose_w, &self.bodies[body].velocity_w);
         let position = pose.rotation * point + pose.translation;
         (position, twist.linear + twist.angular.cross(&position))
     }
@@ -184,10 +176,10 @@ impl NodeKinematics {
         point_w: &Vector3<f64>,
         joint: usize,
     ) -> (Vector3<f64>, Vector3<f64>) {
-        let twist = self.joint_twist_w[joint];
-        let velocity = self.velocity_w[body];
+        let twist = self.bodies[joint].joint_twist_w;
+        let velocity = self.bodies[body].velocity_w;
         let moved = twist.linear + twist.angular.cross(point_w);
-        let relative: Twist = self.velocity_w[joint] - velocity;
+        let relative: Twist = self.bodies[joint].velocity_w - velocity;
         let change = relative.bracket(&twist);
         let rate = change.linear + change.angular.cross(point_w) + velocity.angular.cross(&moved);
         (moved, rate)

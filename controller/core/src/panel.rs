@@ -15,6 +15,7 @@
 
 use alloc::vec;
 use alloc::vec::Vec;
+use core::ops::Range;
 
 use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
 use faer::MatRef;
@@ -133,24 +134,30 @@ impl pulp::WithSimd for TimesTransposed<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let Self { a, b, out } = self;
-        let height = out.stride / S::F64_LANES;
-        for row in (0..height).step_by(2) {
-            if row + 2 <= height {
-                let mut tile = zero_tile::<S, 2>(simd);
-                accumulate(simd, &mut tile, (a, row), (b, 0), a.columns);
-                store::<S, 2>(out, &tile, row, 0, TILE.min(out.columns));
-            } else {
-                let mut tile = zero_tile::<S, 1>(simd);
-                accumulate(simd, &mut tile, (a, row), (b, 0), a.columns);
-                store::<S, 1>(out, &tile, row, 0, TILE.min(out.columns));
-            }
-        }
+        let (rows, columns) = (0..out.stride / S::F64_LANES, 0..out.columns);
+        fill(simd, &ByTransposed { a, b }, out, rows, columns, false);
+    }
+}
+
+/// `a bᵀ`.
+struct ByTransposed<'a> {
+    a: &'a Panel,
+    b: &'a Panel,
+}
+
+impl Tiled for ByTransposed<'_> {
+    #[inline(always)]
+    fn tile<S: Simd, const R: usize>(&self, simd: S, row: usize, column: usize) -> Tile<S, R> {
+        let mut tile = zero_tile::<S, R>(simd);
+        accumulate(simd, &mut tile, (self.a, row), (self.b, column), 0..self.a.columns);
+        tile
     }
 }
 
 /// Writes the first `columns` columns of a tile.
 #[inline(always)]
 pub(crate) fn store<S: Simd, const R: usize>(
+    _: S,
     panel: &mut Panel,
     tile: &Tile<S, R>,
     row: usize,
@@ -201,17 +208,30 @@ impl pulp::WithSimd for TransposedTimes<'_> {
     }
 }
 
-/// Copies the lower triangle of a column-major square matrix onto the upper one, eight by eight.
-pub(crate) fn mirror(matrix: &mut [f64], stride: usize, size: usize) {
-    for first_column in (0..size).step_by(BLOCK) {
-        for first_row in (0..=first_column).step_by(BLOCK) {
-            for column in first_column..size.min(first_column + BLOCK) {
-                for row in first_row..column.min(first_row + BLOCK) {
-                    matrix[column * stride + row] = matrix[row * stride + column];
-                }
-            }
+/// Copies the lower triangle of a column-major square matrix onto the upper one within the tiles of the diagonal.
+pub(crate) fn mirror_diagonal_tiles(matrix: &mut [f64], stride: usize, size: usize) {
+    for column in 0..size {
+        for row in column - column % TILE..column {
+            matrix[column * stride + row] = matrix[row * stride + column];
         }
     }
+}
+
+/// The tile of these columns of a panel at `row` (in registers).
+#[inline(always)]
+pub(crate) fn load_tile<S: Simd, const R: usize>(
+    simd: S,
+    panel: &Panel,
+    columns: Range<usize>,
+    row: usize,
+) -> Tile<S, R> {
+    let mut tile = zero_tile::<S, R>(simd);
+    let stride = panel.stride / S::F64_LANES;
+    let registers = panel.registers::<S>();
+    for (column, entries) in columns.zip(&mut tile) {
+        entries.copy_from_slice(&registers[column * stride + row..][..R]);
+    }
+    tile
 }
 
 /// Sums in registers: six columns of `R` registers.
@@ -223,19 +243,19 @@ pub(crate) fn zero_tile<S: Simd, const R: usize>(simd: S) -> Tile<S, R> {
     [[simd.splat_f64s(0.0); R]; TILE]
 }
 
-/// `tile(r, c) += Σ_l a(row + r, l) b(column + c, l)`, `row` in registers, `column` in doubles, over `depth` columns of both.
+/// `tile(r, c) += Σ_l a(row + r, l) b(column + c, l)`, `row` in registers, `column` in doubles, over these columns `l` of both.
 #[inline(always)]
 pub(crate) fn accumulate<S: Simd, const R: usize>(
     simd: S,
     tile: &mut Tile<S, R>,
     (a, row): (&Panel, usize),
     (b, column): (&Panel, usize),
-    depth: usize,
+    depths: Range<usize>,
 ) {
     let a_stride = a.stride / S::F64_LANES;
     let (a, b_entries) = (a.registers::<S>(), b.entries());
     let mut sums = *tile;
-    for l in 0..depth {
+    for l in depths {
         let a = &a[l * a_stride + row..][..R];
         let b = &b_entries[l * b.stride + column..][..TILE];
         for c in 0..TILE {
@@ -246,6 +266,73 @@ pub(crate) fn accumulate<S: Simd, const R: usize>(
         }
     }
     *tile = sums;
+}
+
+/// `tile(r, c) += Σ_l a(row + r, l) b(l, column + c)`: the same with the second panel by its columns. Columns that `b` does not have
+/// give numbers without meaning.
+#[inline(always)]
+pub(crate) fn accumulate_columns<S: Simd, const R: usize>(
+    simd: S,
+    tile: &mut Tile<S, R>,
+    (a, row): (&Panel, usize),
+    (b, column): (&Panel, usize),
+    depths: Range<usize>,
+) {
+    let a_stride = a.stride / S::F64_LANES;
+    let a = a.registers::<S>();
+    let mut factors = [b.entries(); TILE];
+    for c in 0..TILE {
+        factors[c] = &b.column((column + c).min(b.columns - 1))[..depths.end];
+    }
+    let mut sums = *tile;
+    for l in depths {
+        let a = &a[l * a_stride + row..][..R];
+        for c in 0..TILE {
+            let factor = simd.splat_f64s(factors[c][l]);
+            for r in 0..R {
+                sums[c][r] = simd.mul_add_f64s(a[r], factor, sums[c][r]);
+            }
+        }
+    }
+    *tile = sums;
+}
+
+/// A matrix that is computed tile by tile.
+pub(crate) trait Tiled {
+    /// The tile at `row` (in registers) and `column`. Implementations must be inlined always.
+    fn tile<S: Simd, const R: usize>(&self, simd: S, row: usize, column: usize) -> Tile<S, R>;
+}
+
+/// Writes rows (in registers) and columns of a matrix to a panel; with `lower` only the tiles that reach the diagonal or below.
+///
+/// Bands of rows outside, columns inside: the band of the first factor stays in the first-level cache while the second one, the smaller,
+/// passes by; a band is as high as the registers hold sums for beside the operands, 32 registers of 512 bits, 16 of 256.
+#[inline(always)]
+pub(crate) fn fill<S: Simd>(
+    simd: S,
+    matrix: &impl Tiled,
+    out: &mut Panel,
+    rows: Range<usize>,
+    columns: Range<usize>,
+    lower: bool,
+) {
+    let wide = S::F64_LANES == BLOCK;
+    let height = if wide { 4 } else { 2 };
+    for band in rows.clone().step_by(height) {
+        let end = rows.end.min(band + height);
+        for column in columns.clone().step_by(TILE) {
+            let row = if lower { band.max(column / S::F64_LANES) } else { band };
+            let count = TILE.min(columns.end - column);
+            match end.saturating_sub(row) {
+                0 => break,
+                1 => store(simd, out, &matrix.tile::<S, 1>(simd, row, column), row, column, count),
+                2 => store(simd, out, &matrix.tile::<S, 2>(simd, row, column), row, column, count),
+                3 if wide => store(simd, out, &matrix.tile::<S, 3>(simd, row, column), row, column, count),
+                _ if wide => store(simd, out, &matrix.tile::<S, 4>(simd, row, column), row, column, count),
+                _ => break,
+            }
+        }
+    }
 }
 
 #[cfg(test)]
@@ -260,7 +347,7 @@ mod tests {
         fn with_simd<S: Simd>(self, simd: S) -> Vec<f64> {
             let Product(a, b, depth) = self;
             let mut tile = zero_tile::<S, 1>(simd);
-            accumulate(simd, &mut tile, (a, 0), (b, 3), depth);
+            accumulate(simd, &mut tile, (a, 0), (b, 3), 0..depth);
             tile.iter().map(|column| cast_slice::<S::f64s, f64>(column)[0]).collect()
         }
     }
@@ -287,13 +374,14 @@ mod tests {
     }
 
     #[test]
-    fn mirroring_keeps_to_its_place() {
+    fn mirroring_keeps_to_the_tiles_of_the_diagonal() {
         let mut square: Vec<f64> = (0..16 * 11).map(f64::from).collect();
         let before = square.clone();
-        mirror(&mut square, 16, 11);
+        mirror_diagonal_tiles(&mut square, 16, 11);
         for column in 0..11 {
             for row in 0..16 {
-                let from = if row < column { row * 16 + column } else { column * 16 + row };
+                let mirrored = row < column && row / TILE == column / TILE;
+                let from = if mirrored { row * 16 + column } else { column * 16 + row };
                 assert_eq!(square[column * 16 + row], before[from]);
             }
         }

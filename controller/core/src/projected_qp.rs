@@ -24,7 +24,7 @@
 //! w_i part:  L_i⁻¹ B_i' λ_{i+1}      λ_i = A_i' λ_{i+1} + K_i' (B_i' λ_{i+1})        i = j-1 .. 0
 //! ```
 //!
-//! All new rows sweep together, one matrix product per stage. Rows are scaled to `|g_i| = 1` (`y` and `ρ` with them).
+//! All new rows sweep together (file `adjoint_sweep.rs`). Rows are scaled to `|g_i| = 1` (`y` and `ρ` with them).
 //!
 //! **Row generation.** On the LQR trajectory no row violated: it is the optimum, nothing is solved. Otherwise (D) is solved over the
 //! rows that were active at the last solution ([`ProjectedQp::prepare`]), or when there are none over the most violated ones; the
@@ -49,14 +49,14 @@ use alloc::boxed::Box;
 use alloc::vec;
 use alloc::vec::Vec;
 
-use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
-use faer::{Accum, Mat, MatRef, Par};
+use faer::{Mat, MatRef};
 
 use crate::active_set_dual::ActiveSetDual;
+use crate::adjoint_sweep::AdjointSweep;
 use crate::dual_qp::QpSolver;
 use crate::errors::QpError;
-use crate::kernels::{gemm, gemv};
 use crate::lq_problem::{LqProblem, LqSize, RowId, RowTag};
+use crate::lq_stage::Layout;
 use crate::riccati::Riccati;
 use crate::trajectory::Trajectory;
 
@@ -122,18 +122,14 @@ pub struct ProjectedQp {
     size: LqSize,
     options: ProjectedQpOptions,
     rows: Vec<RowId>,
-    /// `G'`: one column of length `N n_u` per row.
-    row_vectors: Mat<f64>,
+    /// `G`, and `G G'` of rows that are not scaled.
+    sweep: AdjointSweep,
     gram: Mat<f64>,
     /// Norm every row was divided by.
     row_norm: Vec<f64>,
     slack: Vec<f64>,
     upper: Vec<f64>,
     y: Vec<f64>,
-    /// `λ` of the rows in a sweep, one per column, and `B'λ`.
-    adjoint: Mat<f64>,
-    next_adjoint: Mat<f64>,
-    projected: Mat<f64>,
     row_buffer: Vec<f64>,
     w: Vec<f64>,
     v: Mat<f64>,
@@ -157,15 +153,12 @@ impl ProjectedQp {
             size,
             options,
             rows: Vec::with_capacity(capacity),
-            row_vectors: Mat::zeros(stages * inputs, capacity),
+            sweep: AdjointSweep::new(Layout { inputs, states }, stages, capacity),
             gram: Mat::zeros(capacity, capacity),
             row_norm: vec![1.0; capacity],
             slack: vec![0.0; capacity],
             upper: vec![0.0; capacity],
             y: vec![0.0; capacity],
-            adjoint: Mat::zeros(states, capacity),
-            next_adjoint: Mat::zeros(states, capacity),
-            projected: Mat::zeros(inputs, capacity),
             row_buffer: vec![0.0; inputs + states],
             w: vec![0.0; stages * inputs],
             v: Mat::zeros(inputs, stages),
@@ -307,78 +300,71 @@ impl ProjectedQp {
                 self.slack[kept] = self.slack[i];
                 self.upper[kept] = self.upper[i];
                 self.y[kept] = self.y[i];
-                let (mut to, from) = self.row_vectors.as_mut().split_at_col_mut(i);
-                to.as_mut().subcols_mut(kept, 1).copy_from(from.as_ref().subcols(0, 1));
+                self.sweep.move_row(i, kept);
+                // Rows and columns up to here are in place, those from i on are still where they were.
+                for j in 0..self.rows.len() {
+                    self.gram[(kept, j)] = self.gram[(i, j)];
+                }
+                for j in 0..self.rows.len() {
+                    self.gram[(j, kept)] = self.gram[(j, i)];
+                }
             }
             kept += 1;
         }
         self.rows.truncate(kept);
-        if kept > 0 {
-            self.update_gram(0);
-        }
     }
 
-    /// Columns of `G'` for the rows from `first` on, by one backward sweep of all of them together.
+    /// `G` for the rows from `first` on, by one backward sweep of all of them together.
     fn sweep(&mut self, problem: &LqProblem, riccati: &Riccati, first: usize) {
         let LqSize { inputs, stages, .. } = self.size;
-        let total = self.rows.len();
-        self.row_vectors.as_mut().subcols_mut(first, total - first).fill(0.0);
+        let Self { rows, sweep, row_buffer, .. } = self;
+        let total = rows.len();
         // Rows first..active are in the sweep.
         let mut active = first;
-        let last_stage = self.rows.get(first).map_or(0, |row| row.stage as usize);
-        for k in (0..=last_stage.min(stages)).rev() {
-            let count = active - first;
-            let at = k * inputs;
-            if count > 0 {
-                // λ holds the adjoint at node k+1; k < N here because a row of node N enters below first.
-                let (a, b) = (problem.stages[k].a(), problem.stages[k].b());
-                let adjoint = self.adjoint.as_ref().subcols(first, count);
-                gemm(
-                    self.projected.as_mut().subcols_mut(first, count),
-                    Accum::Replace,
-                    b.transpose(),
-                    adjoint,
-                    1.0,
-                );
-                let mut next = self.next_adjoint.as_mut().subcols_mut(first, count);
-                gemm(next.as_mut(), Accum::Replace, a.transpose(), adjoint, 1.0);
-                let projected = self.projected.as_ref().subcols(first, count);
-                gemm(next, Accum::Add, riccati.gain(k).transpose(), projected, 1.0);
-                self.row_vectors.as_mut().submatrix_mut(at, first, inputs, count).copy_from(projected);
-                core::mem::swap(&mut self.adjoint, &mut self.next_adjoint);
+        while rows.get(active).is_some_and(|row| row.stage as usize >= stages) {
+            row_buffer.fill(0.0);
+            problem.add_row(rows[active], 1.0, row_buffer);
+            sweep.set_last(active, &row_buffer[inputs..]);
+            active += 1;
+        }
+        for k in (0..stages).rev() {
+            if active > first {
+                sweep.propagate(problem.stages[k].transition(), first..active);
             }
-            while active < total && self.rows[active].stage as usize == k {
-                self.row_buffer.fill(0.0);
-                problem.add_row(self.rows[active], 1.0, &mut self.row_buffer);
-                let (f, e) = self.row_buffer.split_at(inputs);
-                let adjoint = self.adjoint.col_as_slice_mut(active);
-                adjoint.copy_from_slice(e);
-                if k < stages {
-                    gemv(adjoint, Accum::Add, riccati.gain(k).transpose(), f, 1.0);
-                    self.row_vectors.col_as_slice_mut(active)[at..at + inputs].copy_from_slice(f);
-                }
+            while rows.get(active).is_some_and(|row| row.stage as usize == k) {
+                row_buffer.fill(0.0);
+                problem.add_row(rows[active], 1.0, row_buffer);
+                let (f, e) = row_buffer.split_at(inputs);
+                sweep.set(active, f, e);
                 active += 1;
             }
-            if k < stages && active > first {
-                let block = self.row_vectors.as_mut().submatrix_mut(at, first, inputs, active - first);
-                solve_lower_triangular_in_place(riccati.input_factor(k), block, Par::Seq);
+            if active > first {
+                sweep.project(riccati.factors(k), k, first..active);
             }
+            sweep.clear(k, active..total);
         }
     }
 
-    /// Norm, upper bound and Gram entries of the rows from `first` on.
+    /// Gram entries, norm and upper bound of the rows from `first` on.
     fn normalise(&mut self, problem: &LqProblem, first: usize) {
-        for i in first..self.rows.len() {
-            let column = self.row_vectors.col_as_slice_mut(i);
-            let norm = libm::sqrt(column.iter().map(|entry| entry * entry).sum::<f64>());
+        let LqSize { inputs, stages, .. } = self.size;
+        let total = self.rows.len();
+        // The rows go from the last stage to the first: none of the new ones reaches beyond the first of them.
+        let last = self.rows.get(first).map_or(0, |row| row.stage as usize + 1);
+        self.sweep.update_gram(first..total, last.min(stages) * inputs);
+        for i in first..total {
+            let norm = libm::sqrt(self.sweep.gram(i, i));
             // A row nothing can change keeps norm 1: its multiplier stays where the box puts it.
             let norm = if norm > f64::MIN_POSITIVE && norm.is_finite() { norm } else { 1.0 };
-            column.iter_mut().for_each(|entry| *entry /= norm);
             self.row_norm[i] = norm;
             self.upper[i] = problem.tag(self.rows[i]).penalty * norm;
             self.y[i] = 0.0;
+            for j in 0..=i {
+                let entry = self.sweep.gram(i, j) / (norm * self.row_norm[j]);
+                self.gram[(i, j)] = entry;
+                self.gram[(j, i)] = entry;
+            }
         }
-        self.update_gram(first);
     }
 
     /// Slack on the LQR trajectory of the rows from `first` on.
@@ -396,20 +382,6 @@ impl ProjectedQp {
                 value += dot(f, self.lqr.u(stage));
             }
             self.slack[i] = (problem.bound(row) - value) / self.row_norm[i];
-        }
-    }
-
-    /// Gram entries of the rows from `first` on with all rows.
-    fn update_gram(&mut self, first: usize) {
-        let total = self.rows.len();
-        let vectors = self.row_vectors.as_ref();
-        let new = vectors.subcols(first, total - first);
-        let target = self.gram.as_mut().submatrix_mut(first, 0, total - first, total);
-        gemm(target, Accum::Replace, new.transpose(), vectors.subcols(0, total), 1.0);
-        for row in first..total {
-            for column in 0..row {
-                self.gram[(column, row)] = self.gram[(row, column)];
-            }
         }
     }
 
@@ -452,14 +424,8 @@ impl ProjectedQp {
     /// `w = -G'y`, `v_k = L_k⁻ᵀ w_k`.
     fn recover(&mut self, riccati: &Riccati) {
         let LqSize { inputs, stages, .. } = self.size;
-        let total = self.rows.len();
-        gemv(
-            &mut self.w,
-            Accum::Replace,
-            self.row_vectors.as_ref().subcols(0, total),
-            &self.y[..total],
-            -1.0,
-        );
+        let y = self.y.iter().zip(&self.row_norm).take(self.rows.len()).map(|(y, norm)| -y / norm);
+        self.sweep.transposed_times(y, &mut self.w);
         for k in 0..stages {
             let v = self.v.col_as_slice_mut(k);
             v.copy_from_slice(&self.w[k * inputs..(k + 1) * inputs]);

@@ -9,7 +9,7 @@
 //! ```
 //!
 //! the leading part of a block Cholesky factorisation: `P_k` comes out symmetric by construction (one triangle is computed and
-//! mirrored). The factors `L` stay for the constrained problem ([`crate::projected_qp`]).
+//! read). The factors `L` stay for the constrained problem ([`crate::projected_qp`]).
 //!
 //! All matrices are column panels with rows in registers (file `panel.rs`). With `T' = [B A d]'` as a panel (rows `z̃ = (u, x, 1)`,
 //! [`crate::lq_stage`]), the stage is `W = T' P`, the columns of `u` of `M = [R 0; 0 Q] + T' W'`, their Cholesky panel `(L; Y')`,
@@ -26,14 +26,15 @@
 use alloc::vec;
 use alloc::vec::Vec;
 
-use faer::MatRef;
+use faer::{Mat, MatRef};
 use pulp::Arch;
 
 use crate::eliminate_inputs::{EliminateInputs, Scratch, StageFactors};
 use crate::errors::ControlError;
+use crate::kernels::dot;
 use crate::lq_problem::{LqProblem, LqSize};
 use crate::lq_stage::Layout;
-use crate::panel::Panel;
+use crate::panel::{Panel, mirror_diagonal_tiles};
 use crate::trajectory::Trajectory;
 
 /// Gains and factors of every stage, cost-to-go of the first.
@@ -77,12 +78,11 @@ impl Riccati {
         let LqSize { states, inputs, stages, .. } = self.size;
         for column in 0..states {
             let target = self.cost_to_go.column_mut(column);
-            for (row, entry) in target[..states].iter_mut().enumerate() {
-                let (low, high) = (row.max(column), row.min(column));
-                *entry = problem.terminal_hessian[(low, high)];
-            }
+            target[column..states].copy_from_slice(&problem.terminal_hessian.col_as_slice(column)[column..]);
             target[states] = problem.terminal_gradient[column];
         }
+        let stride = self.cost_to_go.stride();
+        mirror_diagonal_tiles(self.cost_to_go.entries_mut(), stride, states);
         for k in (0..stages).rev() {
             core::mem::swap(&mut self.cost_to_go, &mut self.next_cost_to_go);
             for (x, target) in self.gradient.iter_mut().enumerate() {
@@ -104,6 +104,10 @@ impl Riccati {
         Ok(())
     }
 
+    pub(crate) fn factors(&self, stage: usize) -> &StageFactors {
+        &self.factors[stage]
+    }
+
     /// `K_k`, `n_u x n_x`.
     pub fn gain(&self, stage: usize) -> MatRef<'_, f64> {
         self.factors[stage].gain.view(self.size.states).transpose()
@@ -119,14 +123,14 @@ impl Riccati {
         let factor = &self.factors[stage].input_factor;
         for j in (0..self.size.inputs).rev() {
             let column = &factor.column(j)[..self.size.inputs];
-            let below: f64 = column[j + 1..].iter().zip(&v[j + 1..]).map(|(l, v)| l * v).sum();
-            v[j] = (v[j] - below) / column[j];
+            v[j] = (v[j] - dot(&column[j + 1..], &v[j + 1..])) / column[j];
         }
     }
 
-    /// `P_0`, full symmetric.
-    pub fn cost_to_go(&self) -> MatRef<'_, f64> {
-        self.cost_to_go.view(self.size.states)
+    /// `P_0`, full symmetric. Allocates.
+    pub fn cost_to_go(&self) -> Mat<f64> {
+        let (states, lower) = (self.size.states, self.cost_to_go.view(self.size.states));
+        Mat::from_fn(states, states, |i, j| lower[(i.max(j), i.min(j))])
     }
 
     /// Entry of `p_0`.

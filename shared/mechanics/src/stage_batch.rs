@@ -56,7 +56,7 @@ use crate::spatial::{Momentum, RigidTransform, Twist, Wrench};
 use crate::stage_lanes::{LARGEST_ANGLE, Oct, StageMemory, StageSimd};
 use crate::tree::KinematicTree;
 use column_plan::{Block, Column, columns_in_blocks};
-use memory::{Batch, Scratch};
+use memory::{Batch, Scratch, StartBody};
 
 /// Nodes of a Simpson step.
 const NODES: usize = 3;
@@ -80,6 +80,21 @@ pub struct StageInput<'a> {
     pub force: &'a [f64],
     /// Length of the stage, s.
     pub time_step: f64,
+}
+
+/// One body at the start of a stage, in {0}.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct StartKinematics {
+    /// Pose of the link frame.
+    pub link_pose_w: RigidTransform,
+    /// Joint twist `S_j`.
+    pub joint_twist_w: Twist,
+    /// Spatial velocity.
+    pub velocity_w: Twist,
+    /// `∂P/∂q̇_j` of the total momentum about the origin.
+    pub d_momentum_d_rate: Momentum,
+    /// `∂P/∂q_j`.
+    pub d_momentum_d_q: Momentum,
 }
 
 /// How far the nodes of a stage are from a solution of the step.
@@ -167,10 +182,13 @@ struct Plan {
     blocks: Vec<Block>,
     /// One column with full support: the residual.
     everything: Block,
+    /// Where the columns of `u` and of `(q, q̇)` lie among the blocks, both padded to whole vectors of stages.
+    places: Vec<u32>,
 }
 
 impl Plan {
-    fn new(tree: &KinematicTree, columns: usize) -> Self {
+    /// With blocks of `columns` columns and `count` stages in a vector.
+    fn new(tree: &KinematicTree, columns: usize, count: usize) -> Self {
         let n = tree.dof();
         let mut pair_starts = vec![0];
         for i in 0..n {
@@ -186,7 +204,16 @@ impl Plan {
         depth_first.sort_by(|&a, &b| tree.branch(a as usize).cmp(tree.branch(b as usize)));
         let subtree = |j: usize| &subtrees[subtree_starts[j]..subtree_starts[j + 1]];
         let block = |columns| Block::new(tree, columns, |i| pair_starts[i], subtree);
-        let blocks = columns_in_blocks(&depth_first, columns).into_iter().map(block).collect();
+        let blocks: Vec<Block> = columns_in_blocks(&depth_first, columns).into_iter().map(block).collect();
+        let first_state = n.next_multiple_of(count);
+        let mut places = vec![0; first_state + (2 * n).next_multiple_of(count)];
+        for (at, block) in blocks.iter().enumerate() {
+            for (c, column) in block.columns.iter().enumerate() {
+                let index = column.index(n);
+                let place = if index < n { index } else { index - n + first_state };
+                places[place] = (at * 3 * n * columns + c) as u32;
+            }
+        }
         let everything = block((0..n).map(Column::Position).collect());
         Self {
             tree: tree.clone(),
@@ -194,6 +221,7 @@ impl Plan {
             gravity: (*tree.gravity_w()).into(),
             blocks,
             everything,
+            places,
             pair_starts,
             subtrees,
             subtree_starts,
@@ -276,6 +304,7 @@ fn place<M: StageMemory>(batches: &[Batch<M>], stage: usize) -> (&Batch<M>, usiz
     (&batches[stage / M::COUNT], stage % M::COUNT)
 }
 
+#[inline(always)]
 fn read<M: StageMemory, const N: usize>(memory: &[M; N], lane: usize) -> [f64; N] {
     core::array::from_fn(|k| memory[k].lanes()[lane])
 }
@@ -283,6 +312,24 @@ fn read<M: StageMemory, const N: usize>(memory: &[M; N], lane: usize) -> [f64; N
 fn write<M: StageMemory>(memory: &mut [M], lane: usize, values: &[f64]) {
     for (cell, x) in memory.iter_mut().zip(values) {
         cell.lanes_mut()[lane] = *x;
+    }
+}
+
+impl<M: StageMemory> StartBody<M> {
+    #[inline(always)]
+    fn visit(&self, first: usize, com: Vector3<f64>, mut visit: impl FnMut(usize, &StartKinematics)) {
+        for lane in first..M::COUNT {
+            let rotation = Matrix3::from_row_slice(&read(&self.rotation, lane));
+            let position = Vector3::from(read(&self.position, lane));
+            let kinematics = StartKinematics {
+                link_pose_w: RigidTransform { rotation, translation: position - rotation * com },
+                joint_twist_w: Twist::from_vector(&read(&self.twist, lane).into()),
+                velocity_w: Twist::from_vector(&read(&self.velocity, lane).into()),
+                d_momentum_d_rate: Wrench::from_vector(&read(&self.by_rate, lane).into()),
+                d_momentum_d_q: Wrench::from_vector(&read(&self.by_q, lane).into()),
+            };
+            visit(lane - first, &kinematics);
+        }
     }
 }
 
@@ -367,9 +414,10 @@ impl StageBatch {
         let Some(engine) = Engine::new(tree, stages, instructions) else {
             return refuse(0, "this processor does not have these instructions");
         };
-        let columns = with_work!(&engine, _simd, work => block_columns(work));
+        let (columns, count) =
+            with_work!(&engine, _simd, work => (block_columns(work.count()), work.count()));
         Ok(Self {
-            plan: Plan::new(tree, columns),
+            plan: Plan::new(tree, columns, count),
             engine,
             stages,
             has_end: false,
@@ -641,6 +689,14 @@ impl StageBatch {
         at_stage!(self, stage, batch, lane => Twist::from_vector(&read(&batch.start[body].velocity, lane).into()))
     }
 
+    /// Calls `visit` with the kinematics of one body for stage `first` and those behind it in the same vector, and with their distance
+    /// from `first`: what lies together in memory is read together.
+    #[inline]
+    pub fn visit_start(&self, first: usize, body: usize, visit: impl FnMut(usize, &StartKinematics)) {
+        let com = self.plan.tree.bodies()[body].inertia.com;
+        at_stage!(self, first, batch, lane => batch.start[body].visit(lane, com, visit));
+    }
+
     fn check_stage(&self, stage: usize, count: usize) -> Result<(), ModelError> {
         if stage < count {
             Ok(())
@@ -655,8 +711,8 @@ impl StageBatch {
 }
 
 /// Columns solved together: as many as the registers hold.
-fn block_columns<M: StageMemory>(_: &Work<M>) -> usize {
-    if M::COUNT == 8 { 6 } else { 3 }
+fn block_columns(count: usize) -> usize {
+    if count == 8 { 6 } else { 3 }
 }
 
 /// Whether the processor has these instructions.
@@ -697,9 +753,11 @@ impl<M: StageMemory> Work<M> {
         let (depth, pairs) = (depths().max().unwrap_or(0), depths().sum());
         // One more lane for the node behind the last stage.
         let vectors = (stages + 1).div_ceil(M::COUNT);
+        let columns = (3 * n).next_multiple_of(block_columns(M::COUNT));
+        let places = n.next_multiple_of(M::COUNT) + (2 * n).next_multiple_of(M::COUNT);
         Self {
             batches: vec![Batch::new(n); vectors],
-            scratch: Scratch::new(n, depth, pairs, if M::COUNT == 8 { 6 } else { 3 }),
+            scratch: Scratch::new(n, depth, pairs, (columns, places)),
             marks: elimination::Marks::default(),
         }
     }

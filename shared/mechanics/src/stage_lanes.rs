@@ -70,8 +70,8 @@ pub(crate) trait StageSimd: Copy {
     fn neg_mul_add(self, a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector;
     /// The larger of `a` and `|x|`; either one for a NaN.
     fn max_abs(self, a: Self::Vector, x: Self::Vector) -> Self::Vector;
-    /// As many vectors as there are stages in one, to one vector per stage.
-    fn transpose(self, rows: &[Self::Memory], out: &mut [Self::Memory]);
+    /// As many vectors as there are stages in one, taken from `places` of `rows`, to one vector per stage.
+    fn transpose(self, rows: &[Self::Memory], places: &[u32], out: &mut [Self::Memory]);
     /// Runs a kernel with these instructions enabled.
     fn run<K: StageKernel<Self::Memory>>(self, kernel: K);
 }
@@ -127,8 +127,8 @@ impl StageSimd for Portable {
         [a[0].max(x0.abs()), a[1].max(x1.abs()), a[2].max(x2.abs()), a[3].max(x3.abs())]
     }
     #[inline(always)]
-    fn transpose(self, rows: &[Quad], out: &mut [Quad]) {
-        transpose_quads(rows, out);
+    fn transpose(self, rows: &[Quad], places: &[u32], out: &mut [Quad]) {
+        transpose_quads(rows, places, out);
     }
     #[inline(always)]
     fn run<K: StageKernel<Quad>>(self, kernel: K) {
@@ -137,8 +137,12 @@ impl StageSimd for Portable {
 }
 
 #[inline(always)]
-fn transpose_quads(rows: &[Quad], out: &mut [Quad]) {
-    let (a, b, c, d) = (rows[0].0, rows[1].0, rows[2].0, rows[3].0);
+fn transpose_quads(rows: &[Quad], places: &[u32], out: &mut [Quad]) {
+    let mut r = [[0.0; 4]; 4];
+    for k in 0..4 {
+        r[k] = rows[places[k] as usize].0;
+    }
+    let [a, b, c, d] = r;
     for lane in 0..4 {
         out[lane].0 = [a[lane], b[lane], c[lane], d[lane]];
     }
@@ -146,19 +150,19 @@ fn transpose_quads(rows: &[Quad], out: &mut [Quad]) {
 
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
-fn transpose_quads_with(_: pulp::x86::V3, rows: &[Quad], out: &mut [Quad]) {
-    transpose_quads(rows, out);
+fn transpose_quads_with(_: pulp::x86::V3, rows: &[Quad], places: &[u32], out: &mut [Quad]) {
+    transpose_quads(rows, places, out);
 }
 
 /// Three rounds of eight shuffles: pairs of numbers, pairs of pairs, halves.
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
-fn transpose_octs(simd: pulp::x86::V4, rows: &[Oct], out: &mut [Oct]) {
+fn transpose_octs(simd: pulp::x86::V4, rows: &[Oct], places: &[u32], out: &mut [Oct]) {
     let avx = simd.avx512f;
     let zero = pulp::cast::<[f64; 8], core::arch::x86_64::__m512d>([0.0; 8]);
     let mut r = [zero; 8];
     for k in 0..8 {
-        r[k] = pulp::cast(rows[k].0);
+        r[k] = pulp::cast(rows[places[k] as usize].0);
     }
     for odd in 0..2 {
         let mut pairs = [zero; 4];
@@ -228,8 +232,8 @@ macro_rules! with_pulp {
                 self.$max(a, self.$abs(x))
             }
             #[inline(always)]
-            fn transpose(self, rows: &[$memory], out: &mut [$memory]) {
-                $transpose(self, rows, out)
+            fn transpose(self, rows: &[$memory], places: &[u32], out: &mut [$memory]) {
+                $transpose(self, rows, places, out)
             }
             #[inline(always)]
             fn run<K: StageKernel<$memory>>(self, kernel: K) {

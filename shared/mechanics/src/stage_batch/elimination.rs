@@ -13,7 +13,7 @@
 //! ```
 
 use super::column_plan::{Block, Column};
-use super::memory::{Batch, END, ROWS_AT_ONCE, Scratch};
+use super::memory::{BackwardPanel, Batch, END, ForwardPanel, JOINTS_AT_ONCE, Scratch};
 use super::{Plan, SINGULAR_MASS, TransitionOutput, WEIGHTS};
 use crate::stage_lanes::{StageKernel, StageMemory, StageSimd, Stages, load};
 
@@ -159,15 +159,18 @@ fn eliminate_velocity<S: StageSimd>(simd: S, plan: &Plan, scratch: &mut Scratch<
     }
 }
 
+/// Block columns and block rows of all pairs.
+type Panels<'a, M> = (&'a [ForwardPanel<M>], &'a [BackwardPanel<M>]);
+
 /// Solves one block of `C` columns in place.
 #[inline(always)]
 fn solve<S: StageSimd, const C: usize>(
     simd: S,
     plan: &Plan,
     block: &Block,
-    scratch: &mut Scratch<S::Memory>,
+    (forward, backward): Panels<'_, S::Memory>,
+    columns: &mut [S::Memory],
 ) {
-    let Scratch { forward, backward, columns, .. } = scratch;
     let zero = Stages::splat(simd, 0.0);
     for row in &block.rows {
         let at = row.joint as usize * 3 * C;
@@ -247,14 +250,15 @@ impl<M: StageMemory> StageKernel<M> for Correct<'_, M> {
     #[inline(always)]
     fn run<S: StageSimd<Memory = M>>(self, simd: S) {
         let Self { plan, batch, scratch, apply } = self;
+        let Scratch { forward, backward, columns, .. } = scratch;
         for (i, [first, second]) in batch.residual.iter().enumerate() {
-            scratch.columns[3 * i] = (-Stages::load(simd, first)).store();
-            scratch.columns[3 * i + 1] = (-Stages::load(simd, second)).store();
-            scratch.columns[3 * i + 2] = M::default();
+            columns[3 * i] = (-Stages::load(simd, first)).store();
+            columns[3 * i + 1] = (-Stages::load(simd, second)).store();
+            columns[3 * i + 2] = M::default();
         }
-        solve::<S, 1>(simd, plan, &plan.everything, scratch);
+        solve::<S, 1>(simd, plan, &plan.everything, (forward, backward), columns);
         for (i, correction) in batch.correction.iter_mut().enumerate() {
-            *correction = [scratch.columns[3 * i], scratch.columns[3 * i + 1], scratch.columns[3 * i + 2]];
+            *correction = [columns[3 * i], columns[3 * i + 1], columns[3 * i + 2]];
             if apply {
                 for alpha in 1..=2 {
                     let node = &mut batch.nodes[alpha][i];
@@ -291,11 +295,15 @@ impl<M: StageMemory> StageKernel<M> for Columns<'_, '_, M> {
 #[inline(always)]
 fn all_blocks<S: StageSimd, const C: usize>(simd: S, work: &mut Columns<'_, '_, S::Memory>) {
     let plan = work.plan;
-    for block in &plan.blocks {
-        fill::<S, C>(simd, plan, block, work.batch, work.scratch);
-        solve::<S, C>(simd, plan, block, work.scratch);
-        write::<S, C>(simd, plan, block, work);
+    let Scratch { sides, forward, backward, columns, .. } = &mut *work.scratch;
+    for (block, columns) in plan.blocks.iter().zip(columns.chunks_exact_mut(3 * plan.n * C)) {
+        fill::<S, C>(simd, plan, block, work.batch, sides, columns);
+        solve::<S, C>(simd, plan, block, (forward, backward), columns);
+        if !work.batch.interior.is_empty() {
+            keep_interior::<S::Memory, C>(plan, block, columns, &mut work.batch.interior);
+        }
     }
+    write::<S, C>(simd, plan, work);
 }
 
 /// The right-hand sides of a block on its support.
@@ -305,9 +313,9 @@ fn fill<S: StageSimd, const C: usize>(
     plan: &Plan,
     block: &Block,
     batch: &Batch<S::Memory>,
-    scratch: &mut Scratch<S::Memory>,
+    sides: &[[S::Memory; 7]],
+    columns: &mut [S::Memory],
 ) {
-    let Scratch { sides, columns, .. } = scratch;
     let step = Stages::load(simd, &batch.time_step);
     for row in &block.rows {
         let at = row.joint as usize * 3 * C;
@@ -347,35 +355,39 @@ fn fill<S: StageSimd, const C: usize>(
     }
 }
 
-/// Hands the columns of a solved block over: `q^1` stays with the stages, `q_{k+1}` and `q̇_{k+1}` go to the caller.
+/// Keeps the sensitivities of the interior nodes of a solved block.
 #[inline(always)]
-fn write<S: StageSimd, const C: usize>(
-    simd: S,
+fn keep_interior<M: StageMemory, const C: usize>(
     plan: &Plan,
     block: &Block,
-    work: &mut Columns<'_, '_, S::Memory>,
+    columns: &[M],
+    interior: &mut [M],
 ) {
+    let n = plan.n;
+    for (c, column) in block.columns.iter().enumerate() {
+        let index = column.index(n);
+        let interior = &mut interior[index * n..(index + 1) * n];
+        for (cell, cells) in interior.iter_mut().zip(columns.chunks_exact(3 * C)) {
+            *cell = cells[c];
+        }
+    }
+}
+
+/// Turns the rows of `q_{k+1}` and `q̇_{k+1}` from vectors of stages to stages, a square of columns at a time, and hands them to the
+/// caller. All at the end: between the blocks, whose panels stream through the caches, it would cost as much as solving.
+#[inline(always)]
+fn write<S: StageSimd, const C: usize>(simd: S, plan: &Plan, work: &mut Columns<'_, '_, S::Memory>) {
     let n = plan.n;
     let count = S::Memory::COUNT;
     let Scratch { columns, transposed, .. } = &mut *work.scratch;
-    if !work.batch.interior.is_empty() {
-        for (c, column) in block.columns.iter().enumerate() {
-            let index = column.index(n);
-            let interior = &mut work.batch.interior[index * n..(index + 1) * n];
-            for (cell, row) in interior.iter_mut().zip(columns.chunks_exact(3 * C)) {
-                *cell = row[c];
+    let width = plan.places.len();
+    for first in (0..n).step_by(JOINTS_AT_ONCE) {
+        let joints = first..n.min(first + JOINTS_AT_ONCE);
+        for (at, turned) in transposed.chunks_exact_mut(width).enumerate().take(2 * joints.len()) {
+            let cells = &columns[((first + at / 2) * 3 + 1 + at % 2) * C..];
+            for (places, turned) in plan.places.chunks_exact(count).zip(turned.chunks_exact_mut(count)) {
+                simd.transpose(cells, places, turned);
             }
-        }
-    }
-    // The 2 C numbers of a joint in every stage: as two squares, which overlap.
-    let overlap = 2 * count - 2 * C;
-    for first in (0..n).step_by(ROWS_AT_ONCE) {
-        let joints = first..n.min(first + ROWS_AT_ONCE);
-        for (joint, squares) in joints.clone().zip(transposed.chunks_exact_mut(2 * count)) {
-            let numbers = &columns[(joint * 3 + 1) * C..][..2 * C];
-            let (front, back) = squares.split_at_mut(count);
-            simd.transpose(numbers, front);
-            simd.transpose(&numbers[2 * C - count..], back);
         }
         for (lane, stage) in work.stages.clone().enumerate() {
             let rows = work.output.transition(stage);
@@ -384,23 +396,27 @@ fn write<S: StageSimd, const C: usize>(
                 work.short.get_or_insert((length.min(needed - 1), needed));
                 continue;
             }
-            let stride = rows.row_stride;
-            let mut places = [0; C];
-            for (place, column) in places.iter_mut().zip(&block.columns) {
-                let index = column.index(n);
-                *place = if index < n { index } else { index - n + rows.first_state };
+            for (at, turned) in transposed.chunks_exact(width).enumerate().take(2 * joints.len()) {
+                let row = &mut rows.values[(first + at / 2 + at % 2 * n) * rows.row_stride..];
+                let (by_input, by_state) = turned.split_at(n.next_multiple_of(count));
+                gather(lane, by_input, &mut row[..n]);
+                gather(lane, by_state, &mut row[rows.first_state..][..2 * n]);
             }
-            let (positions, rates) = rows.values.split_at_mut(n * stride);
-            for (joint, squares) in joints.clone().zip(transposed.chunks_exact(2 * count)) {
-                let (front, back) = (squares[lane].lanes(), squares[count + lane].lanes());
-                let position = &mut positions[joint * stride..];
-                let rate = &mut rates[joint * stride..];
-                for (c, &place) in places[..block.columns.len()].iter().enumerate() {
-                    position[place] = front[c];
-                    let c = C + c;
-                    rate[place] = if c < count { front[c] } else { back[c - count + overlap] };
-                }
-            }
+        }
+    }
+}
+
+/// The numbers of one lane, out of squares whose rows are the lanes.
+#[inline(always)]
+fn gather<M: StageMemory>(lane: usize, squares: &[M], out: &mut [f64]) {
+    let mut whole = out.chunks_exact_mut(M::COUNT);
+    let mut squares = squares.chunks_exact(M::COUNT);
+    for (out, square) in (&mut whole).zip(&mut squares) {
+        out.copy_from_slice(square[lane].lanes());
+    }
+    if let Some(square) = squares.next() {
+        for (out, from) in whole.into_remainder().iter_mut().zip(square[lane].lanes()) {
+            *out = *from;
         }
     }
 }

@@ -6,8 +6,8 @@ use alloc::vec::Vec;
 use super::NODES;
 use crate::stage_lanes::StageMemory;
 
-/// Joints whose finished numbers are turned from vectors of stages to stages at a time: what the first-level cache holds easily.
-pub(crate) const ROWS_AT_ONCE: usize = 8;
+/// Joints whose finished rows are turned from vectors of stages to stages at a time: what the first-level cache holds easily.
+pub(crate) const JOINTS_AT_ONCE: usize = 2;
 
 /// One vector of stages: inputs and results.
 #[derive(Clone, Debug)]
@@ -122,14 +122,15 @@ pub(crate) struct Scratch<M> {
     pub backward: Vec<BackwardPanel<M>>,
     /// Right-hand sides: rows 0, 1, velocity of row body, column branch; the same mirrored; `-M(q^0)`.
     pub sides: Vec<[M; 7]>,
-    /// Block of columns that is being solved: `[(joint 3 + row) columns + column]`.
+    /// Blocks of columns, one after the other, each `[(joint 3 + row) columns + column]`.
     pub columns: Vec<M>,
-    /// Finished numbers of some joints, stage by stage: two squares per joint.
+    /// Finished rows of some joints, all columns, stage by stage in squares.
     pub transposed: Vec<M>,
 }
 
 impl<M: StageMemory> Scratch<M> {
-    pub fn new(n: usize, depth: usize, pairs: usize, columns: usize) -> Self {
+    /// `columns` with the padding of the blocks, `places` with that of the squares.
+    pub fn new(n: usize, depth: usize, pairs: usize, (columns, places): (usize, usize)) -> Self {
         let zeros = || vec![M::default(); n];
         let twists = || vec![[M::default(); 6]; n];
         Self {
@@ -150,7 +151,7 @@ impl<M: StageMemory> Scratch<M> {
             backward: vec![[M::default(); 7]; pairs],
             sides: vec![[M::default(); 7]; pairs],
             columns: vec![M::default(); 3 * n * columns],
-            transposed: vec![M::default(); 2 * M::COUNT * ROWS_AT_ONCE],
+            transposed: vec![M::default(); 2 * JOINTS_AT_ONCE * places],
         }
     }
 }
