@@ -205,6 +205,13 @@ impl DelHessian {
         self.mirror.is_empty()
     }
 
+    /// Blocks of all pairs of a body, root first: `s + 1` rows of the lane groups each.
+    #[inline(always)]
+    pub(crate) fn body_blocks(&self, body: usize) -> &[Quad] {
+        let block = (self.s + 1) * self.groups;
+        &self.blocks[self.pair_starts[body] * block..self.pair_starts[body + 1] * block]
+    }
+
     /// `H[α,γ]` for the joint coordinate of `body` (row) and coordinate `position` of its branch (column).
     #[inline(always)]
     pub(crate) fn entry(&self, pair: usize, alpha: usize, gamma: usize) -> f64 {
@@ -239,16 +246,16 @@ impl DelHessian {
         self.impulse_columns[dof * self.groups + gamma / LANES].map(|q| q.0[gamma % LANES])
     }
 
-    /// `S^0ᵀ` of [`DelHessian::shift_row`], component `k`.
+    /// `S^0ᵀ` of [`DelHessian::shift_row`].
     #[inline(always)]
-    pub(crate) fn shift_on_base(&self, dof: usize, k: usize, alpha: usize) -> f64 {
-        self.shifts_on_base[dof * self.groups + alpha / LANES][k].0[alpha % LANES]
+    pub(crate) fn shift_on_base(&self, dof: usize, alpha: usize) -> [f64; 6] {
+        self.shifts_on_base[dof * self.groups + alpha / LANES].each_ref().map(|q| q.0[alpha % LANES])
     }
 
-    /// `S^sᵀ` of [`DelHessian::impulse_column`], component `k`.
+    /// `S^sᵀ` of [`DelHessian::impulse_column`].
     #[inline(always)]
-    pub(crate) fn impulse_on_base(&self, dof: usize, k: usize, gamma: usize) -> f64 {
-        self.impulses_on_base[dof * self.groups + gamma / LANES][k].0[gamma % LANES]
+    pub(crate) fn impulse_on_base(&self, dof: usize, gamma: usize) -> [f64; 6] {
+        self.impulses_on_base[dof * self.groups + gamma / LANES].each_ref().map(|q| q.0[gamma % LANES])
     }
 
     /// `(𝒴 - ad^D_Γ)^α e_k` of the base, times `w_α Δt`.
@@ -287,18 +294,19 @@ impl Kernel for Assemble<'_> {
     fn run<S: Simd>(self, simd: S) {
         // With constant arguments the loops over nodes unroll.
         match (self.hessian.s, self.hessian.groups) {
-            (1, 1) if S::SPECIALISE => assemble(simd, self, 1, 1),
-            (2, 1) if S::SPECIALISE => assemble(simd, self, 2, 1),
-            (s, groups) => assemble(simd, self, s, groups),
+            (1, 1) if S::SPECIALISE => assemble::<S, 1>(simd, self, 1, 1),
+            (2, 1) if S::SPECIALISE => assemble::<S, 1>(simd, self, 2, 1),
+            (3, 1) if S::SPECIALISE => assemble::<S, 1>(simd, self, 3, 1),
+            (s, groups) => assemble::<S, MAX_GROUPS>(simd, self, s, groups),
         }
     }
 }
 
 #[inline(always)]
-fn assemble<S: Simd>(simd: S, work: Assemble<'_>, s: usize, groups: usize) {
+fn assemble<S: Simd, const G: usize>(simd: S, work: Assemble<'_>, s: usize, groups: usize) {
     let Assemble { tree, del, hessian } = work;
     for i in tree.first_joint_body()..tree.body_count() {
-        joint_pairs(simd, tree, del, hessian, i, s, groups);
+        joint_pairs::<S, G>(simd, tree, del, hessian, i, s, groups);
     }
 }
 
@@ -340,9 +348,10 @@ impl Kernel for BasePairs<'_> {
         let (s, groups) = (hessian.s, hessian.groups);
         // With constant arguments the loops over nodes unroll.
         match (s, groups) {
-            (1, 1) if S::SPECIALISE => base_pairs(simd, tree, del, hessian, 1, 1),
-            (2, 1) if S::SPECIALISE => base_pairs(simd, tree, del, hessian, 2, 1),
-            (s, groups) => base_pairs(simd, tree, del, hessian, s, groups),
+            (1, 1) if S::SPECIALISE => base_pairs::<S, 1>(simd, tree, del, hessian, 1, 1),
+            (2, 1) if S::SPECIALISE => base_pairs::<S, 1>(simd, tree, del, hessian, 2, 1),
+            (3, 1) if S::SPECIALISE => base_pairs::<S, 1>(simd, tree, del, hessian, 3, 1),
+            (s, groups) => base_pairs::<S, MAX_GROUPS>(simd, tree, del, hessian, s, groups),
         }
         if !hessian.general.is_empty() {
             for i in 0..tree.body_count() {
@@ -562,23 +571,35 @@ fn general_terms<S: Simd>(
 }
 
 /// Lanes of the pair terms, per group, before the nodes are mixed.
-#[derive(Clone, Copy, Default)]
-struct PairTerms {
+#[derive(Clone, Copy)]
+struct PairTerms<const G: usize> {
     /// `K_q̇q̇`.
-    mass: [Quad; MAX_GROUPS],
+    mass: [Quad; G],
     /// `w_α Δt (K_qq - V_qq + τ_q)`.
-    stiffness: [Quad; MAX_GROUPS],
+    stiffness: [Quad; G],
     /// `K_qq̇ + τ_q̇` of the row's own node.
-    row: [Quad; MAX_GROUPS],
+    row: [Quad; G],
     /// `K_q̇q`.
-    column: [Quad; MAX_GROUPS],
+    column: [Quad; G],
+}
+
+impl<const G: usize> PairTerms<G> {
+    const ZERO: Self =
+        Self { mass: [Quad::ZERO; G], stiffness: [Quad::ZERO; G], row: [Quad::ZERO; G], column: [Quad::ZERO; G] };
 }
 
 const MAX_GROUPS: usize = (crate::lobatto::MAX_UNKNOWN_NODES + LANES) / LANES;
 
 /// Mixes the nodes: the formula of the module doc for one pair.
 #[inline(always)]
-fn mix<S: Simd>(simd: S, tables: &Tables<'_>, terms: &PairTerms, s: usize, groups: usize, out: &mut [Quad]) {
+fn mix<S: Simd, const G: usize>(
+    simd: S,
+    tables: &Tables<'_>,
+    terms: &PairTerms<G>,
+    s: usize,
+    groups: usize,
+    out: &mut [Quad],
+) {
     for alpha in 0..=s {
         for g in 0..groups {
             let at = alpha * groups + g;
@@ -604,7 +625,7 @@ struct Tables<'a> {
 }
 
 #[inline(always)]
-fn joint_pairs<S: Simd>(
+fn joint_pairs<S: Simd, const G: usize>(
     simd: S,
     tree: &KinematicTree,
     del: &DelWorkspace,
@@ -616,7 +637,7 @@ fn joint_pairs<S: Simd>(
     let constants = &tree.constants()[i];
     let own = tree.joint_dof(i);
     let mass = constants.subtree_mass;
-    let mut rows = [RowLanes::default(); MAX_GROUPS];
+    let mut rows = [RowLanes::default(); G];
     for g in 0..groups {
         let at = i * groups + g;
         let body = &del.bodies[at];
@@ -635,7 +656,7 @@ fn joint_pairs<S: Simd>(
     let first_pair = hessian.pair_starts[i];
     for (position, &dof) in tree.branch(i).iter().enumerate() {
         let j = dof as usize;
-        let (mut terms, mut mirror) = (PairTerms::default(), PairTerms::default());
+        let (mut terms, mut mirror) = (PairTerms::<G>::ZERO, PairTerms::<G>::ZERO);
         for g in 0..groups {
             let column = &hessian.columns[j * groups + g];
             let twist: Lane6<S> = load(simd, &column.twist);
@@ -739,7 +760,7 @@ fn base_columns<S: Simd>(simd: S, base: &BaseLanes, hessian: &mut DelHessian, gr
 
 /// Base-base blocks, and the shift rows and impulse columns of the base.
 #[inline(always)]
-fn base_pairs<S: Simd>(
+fn base_pairs<S: Simd, const G: usize>(
     simd: S,
     tree: &KinematicTree,
     del: &DelWorkspace,
@@ -764,7 +785,7 @@ fn base_pairs<S: Simd>(
     let mass = tree.constants()[0].subtree_mass;
     let block = (s + 1) * groups;
     // N(μ), Ṅ(μ), N(Γ) of every group.
-    let mut curved = [[[Quad::ZERO; 18]; 3]; MAX_GROUPS];
+    let mut curved = [[[Quad::ZERO; 18]; 3]; G];
     for g in 0..groups {
         let (base, body) = (&del.base[g], &del.bodies[g]);
         let momentum = load(simd, &body.momentum);
@@ -775,10 +796,10 @@ fn base_pairs<S: Simd>(
         ];
     }
     // What a column brings to all its rows: 𝓜S, 𝓜Ṡ, ad^D_μ Ṡ + 𝒴S + 𝒵Ṡ, 𝒵S.
-    let mut carried = [[[Quad::ZERO; 6]; 6]; MAX_GROUPS];
-    let mut carried_rates = [[[Quad::ZERO; 6]; 6]; MAX_GROUPS];
-    let mut forces = [[[Quad::ZERO; 6]; 6]; MAX_GROUPS];
-    let mut drags = [[[Quad::ZERO; 6]; 6]; MAX_GROUPS];
+    let mut carried = [[[Quad::ZERO; 6]; 6]; G];
+    let mut carried_rates = [[[Quad::ZERO; 6]; 6]; G];
+    let mut forces = [[[Quad::ZERO; 6]; 6]; G];
+    let mut drags = [[[Quad::ZERO; 6]; 6]; G];
     for g in 0..groups {
         let momentum: Lane6<S> = load(simd, &del.bodies[g].momentum);
         for l in 0..6 {
@@ -798,9 +819,11 @@ fn base_pairs<S: Simd>(
             forces[g][l] = store(force);
         }
     }
+    // Without general wrenches the entries behind the diagonal are mirror images.
+    let symmetric = hessian.general.is_empty();
     for k in 0..6 {
-        for l in 0..6 {
-            let mut terms = PairTerms::default();
+        for l in 0..if symmetric { k + 1 } else { 6 } {
+            let mut terms = PairTerms::<G>::ZERO;
             for g in 0..groups {
                 let row = &hessian.columns[k * groups + g];
                 let (row_twist, row_rate): (Lane6<S>, Lane6<S>) =
@@ -833,6 +856,15 @@ fn base_pairs<S: Simd>(
             }
             let at = (6 * k + l) * block;
             mix(simd, &tables, &terms, s, groups, &mut hessian.base_blocks[at..at + block]);
+            if symmetric && l < k {
+                let image = (6 * l + k) * block;
+                for alpha in 0..=s {
+                    for gamma in 0..=s {
+                        hessian.base_blocks[image + gamma * groups + alpha / LANES].0[alpha % LANES] =
+                            hessian.base_blocks[at + alpha * groups + gamma / LANES].0[gamma % LANES];
+                    }
+                }
+            }
         }
     }
 }

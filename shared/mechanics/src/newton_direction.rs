@@ -119,42 +119,43 @@ impl NewtonDirection for NewtonSolver {
     }
 }
 
-/// An entry of the Newton matrix in the rows or columns of the base.
-pub(crate) enum BaseEntry {
-    Set(f64),
-    Add(f64),
+/// Where the rows and columns of a floating base go: a dense matrix or the panels of the branch LU, filled with `H[α,γ]` before.
+/// Nodes count from 0 in rows (`α`) and in columns (`γ - 1`).
+pub(crate) trait BaseEntries {
+    /// Row `(dof, alpha)` of a joint, the six base columns of the last node.
+    fn add_to_last_base_columns(&mut self, dof: usize, alpha: usize, changes: [f64; 6]);
+    /// The six base rows of node 0, column `(dof, gamma)` of a joint.
+    fn add_to_first_base_rows(&mut self, dof: usize, gamma: usize, changes: [f64; 6]);
+    /// A base-base entry, `[coordinate, node]` of row and column.
+    fn set_base(&mut self, row: [usize; 2], column: [usize; 2], value: f64);
 }
 
 /// Everything in the Newton matrix of a floating tree that is not plainly `H[α,γ]` (module doc of [`crate::del_hessian`]).
-///
-/// Calls `put([coordinate, α], [coordinate, γ - 1], entry)`, row first: `Set` for all base-base entries and the joint columns of
-/// the base rows `α = 0`; `Add` for what comes on top of `H` in the base columns of the joint rows.
-pub(crate) fn jacobian_column_rule(
+/// `s` is the number of unknown nodes (a constant where the caller wants the loops unrolled).
+#[inline(always)]
+pub(crate) fn write_base_entries(
     tree: &KinematicTree,
     del: &DelWorkspace,
     hessian: &DelHessian,
-    mut put: impl FnMut([usize; 2], [usize; 2], BaseEntry),
+    s: usize,
+    mut target: impl BaseEntries,
 ) {
-    let s = del.unknown_nodes();
     let start_twists = base_matrix(del, 0);
     let end_twists = base_matrix(del, s);
-    let last = s - 1;
 
     for i in 1..tree.body_count() {
         let dof = tree.joint_dof(i);
         let first_pair = hessian.pair_starts[i];
         for alpha in 0..s {
-            for k in 0..6 {
-                let change = hessian.shift_on_base(dof, k, alpha) - hessian.entry(first_pair + k, alpha, 0);
-                put([dof, alpha], [k, last], BaseEntry::Add(change));
-            }
+            let shifts = hessian.shift_on_base(dof, alpha);
+            let changes = core::array::from_fn(|k| shifts[k] - hessian.entry(first_pair + k, alpha, 0));
+            target.add_to_last_base_columns(dof, alpha, changes);
         }
         for gamma in 1..=s {
-            for k in 0..6 {
-                let ahead =
-                    hessian.mirrored(first_pair + k, 0, gamma) - hessian.mirrored(first_pair + k, s, gamma);
-                put([k, 0], [dof, gamma - 1], BaseEntry::Set(ahead + hessian.impulse_on_base(dof, k, gamma)));
-            }
+            let impulses = hessian.impulse_on_base(dof, gamma);
+            let changes =
+                core::array::from_fn(|k| impulses[k] - hessian.mirrored(first_pair + k, s, gamma));
+            target.add_to_first_base_rows(dof, gamma - 1, changes);
         }
     }
 
@@ -174,23 +175,31 @@ pub(crate) fn jacobian_column_rule(
         second_order_matrix(del, s, &momentum_end) - second_order_matrix(del, 0, &del.start_momentum());
     let last_column = end_twists.tr_mul(&(shifted_impulse + turned)) + curved;
     for k in 0..6 {
-        for l in 0..6 {
-            for gamma in 1..=s {
-                for alpha in 1..s {
+        for alpha in 1..s {
+            let shifts = hessian.shift_on_base(k, alpha);
+            for l in 0..6 {
+                for gamma in 1..=s {
                     let mut value = hessian.base_entry(k, l, alpha, gamma);
                     if gamma == s {
-                        value += hessian.shift_on_base(k, l, alpha) - hessian.base_entry(k, l, alpha, 0);
+                        value += shifts[l] - hessian.base_entry(k, l, alpha, 0);
                     }
-                    put([k, alpha], [l, gamma - 1], BaseEntry::Set(value));
+                    target.set_base([k, alpha], [l, gamma - 1], value);
                 }
+            }
+        }
+    }
+    for l in 0..6 {
+        for gamma in 1..=s {
+            let impulses = hessian.impulse_on_base(l, gamma);
+            for k in 0..6 {
                 let mut value = hessian.base_entry(k, l, 0, gamma) - hessian.base_entry(k, l, s, gamma)
-                    + hessian.impulse_on_base(l, k, gamma);
+                    + impulses[k];
                 if gamma == s {
-                    value += last_column[(k, l)] + hessian.shift_on_base(k, l, 0)
-                        - hessian.shift_on_base(k, l, s)
+                    value += last_column[(k, l)] + hessian.shift_on_base(k, 0)[l]
+                        - hessian.shift_on_base(k, s)[l]
                         - (hessian.base_entry(k, l, 0, 0) - hessian.base_entry(k, l, s, 0));
                 }
-                put([k, 0], [l, gamma - 1], BaseEntry::Set(value));
+                target.set_base([k, 0], [l, gamma - 1], value);
             }
         }
     }
