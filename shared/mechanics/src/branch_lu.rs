@@ -26,7 +26,7 @@ use crate::del_residual::DelWorkspace;
 use crate::errors::FactorError;
 use crate::lanes::{Instructions, LANES, Quad};
 use crate::lobatto::MAX_UNKNOWN_NODES;
-use crate::newton_direction::{NewtonDirection, write_base_entries};
+use crate::newton_direction::{NewtonDirection, base_block};
 use crate::row_matrix::RowMatrix;
 use crate::tree::KinematicTree;
 
@@ -36,7 +36,7 @@ mod solve_many;
 mod solve_one;
 
 use elimination::Eliminate;
-use panels::{JointPanels, PanelTarget, fill_joint_panels};
+use panels::{JointPanels, fill_joint_panels};
 use solve_many::{BackwardMany, ForwardMany, Relatives};
 use solve_one::{Branches, SolveOne};
 
@@ -138,19 +138,38 @@ impl BranchLu {
         }
     }
 
+    /// The rows and columns of the base, whose coordinates are the first six places of every branch.
     #[inline(always)]
     fn load_base(&mut self, tree: &KinematicTree, del: &DelWorkspace, s: usize) {
-        let base = tree.base_dof();
+        let (base, groups) = (tree.base_dof(), (s + LANES) / LANES);
+        for i in tree.first_joint_body()..tree.body_count() {
+            let dof = tree.joint_dof(i);
+            let joint = self.hessian.joint_and_base(i, dof, s, groups);
+            let rows = &mut self.rows[self.row_starts[dof]..self.row_starts[dof + 1]];
+            let columns = &mut self.columns[self.column_starts[dof]..self.column_starts[dof + 1]];
+            for k in 0..6 {
+                for node in 0..s {
+                    for other in 0..s {
+                        let at = k * s + other;
+                        rows[at / LANES * s + node].0[at % LANES] = joint.joint_row(k, node, other + 1);
+                        columns[at / LANES * s + node].0[at % LANES] = joint.base_row(k, other, node + 1);
+                    }
+                }
+            }
+        }
         self.rows[..self.row_starts[base]].fill(Quad::ZERO);
         self.columns[..self.column_starts[base]].fill(Quad::ZERO);
-        let target = PanelTarget {
-            rows: &mut self.rows,
-            columns: &mut self.columns,
-            row_starts: &self.row_starts,
-            column_starts: &self.column_starts,
-            s,
-        };
-        write_base_entries(tree, del, &self.hessian, s, target);
+        let (rows, columns) = (&mut self.rows, &mut self.columns);
+        let (row_starts, column_starts) = (&self.row_starts, &self.column_starts);
+        base_block(del, &self.hessian, s, |[row, alpha], [column, gamma], value| {
+            if column > row {
+                let at = row * s + alpha;
+                columns[column_starts[column] + at / LANES * s + gamma].0[at % LANES] = value;
+            } else {
+                let at = column * s + gamma;
+                rows[row_starts[row] + at / LANES * s + alpha].0[at % LANES] = value;
+            }
+        });
     }
 }
 

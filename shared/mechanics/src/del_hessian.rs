@@ -37,7 +37,7 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use crate::del_residual::{DelWorkspace, load_arm};
-use crate::floating_base::{BaseLanes, base_project, second_order, second_order_rate};
+use crate::floating_base::{BaseLanes, base_project, base_project_both, second_order, second_order_rate};
 use crate::gravity_hessian::gravity_column;
 use crate::kinetic_hessian::{CompositeLanes, composite_times, kinetic_columns, own_inertia};
 use crate::lanes::{
@@ -249,13 +249,34 @@ impl DelHessian {
     /// `S^0ᵀ` of [`DelHessian::shift_row`].
     #[inline(always)]
     pub(crate) fn shift_on_base(&self, dof: usize, alpha: usize) -> [f64; 6] {
-        self.shifts_on_base[dof * self.groups + alpha / LANES].each_ref().map(|q| q.0[alpha % LANES])
+        lane(&self.shifts_on_base[dof * self.groups + alpha / LANES], alpha)
     }
 
     /// `S^sᵀ` of [`DelHessian::impulse_column`].
     #[inline(always)]
     pub(crate) fn impulse_on_base(&self, dof: usize, gamma: usize) -> [f64; 6] {
-        self.impulses_on_base[dof * self.groups + gamma / LANES].each_ref().map(|q| q.0[gamma % LANES])
+        lane(&self.impulses_on_base[dof * self.groups + gamma / LANES], gamma)
+    }
+
+    /// What a joint of a floating tree shares with the base. `s` and `groups` may be constants.
+    #[inline(always)]
+    pub(crate) fn joint_and_base(
+        &self,
+        body: usize,
+        dof: usize,
+        s: usize,
+        groups: usize,
+    ) -> JointAndBase<'_> {
+        let block = (s + 1) * groups;
+        let pairs = self.pair_starts[body] * block..(self.pair_starts[body] + 6) * block;
+        JointAndBase {
+            blocks: &self.blocks[pairs.clone()],
+            mirror: if self.mirror.is_empty() { &[] } else { &self.mirror[pairs] },
+            shifts: &self.shifts_on_base[dof * groups..(dof + 1) * groups],
+            impulses: &self.impulses_on_base[dof * groups..(dof + 1) * groups],
+            s,
+            groups,
+        }
     }
 
     /// `(𝒴 - ad^D_Γ)^α e_k` of the base, times `w_α Δt`.
@@ -279,6 +300,62 @@ impl DelHessian {
                 }
             }
         }
+    }
+}
+
+/// One node of a 6-vector.
+#[inline(always)]
+fn lane(quads: &[Quad; 6], node: usize) -> [f64; 6] {
+    let mut out = [0.0; 6];
+    for k in 0..6 {
+        out[k] = quads[k].0[node % LANES];
+    }
+    out
+}
+
+/// The Newton matrix between a joint and the base: `H` with the column rule of the module doc.
+#[derive(Clone, Copy)]
+pub(crate) struct JointAndBase<'a> {
+    blocks: &'a [Quad],
+    mirror: &'a [Quad],
+    shifts: &'a [[Quad; 6]],
+    impulses: &'a [[Quad; 6]],
+    s: usize,
+    groups: usize,
+}
+
+impl JointAndBase<'_> {
+    /// Row α of the joint, column γ of base coordinate `k`.
+    #[inline(always)]
+    pub fn joint_row(&self, k: usize, alpha: usize, gamma: usize) -> f64 {
+        let plain = self.plain(k, alpha, gamma);
+        if gamma < self.s {
+            return plain;
+        }
+        plain + (self.shifts[alpha / LANES][k].0[alpha % LANES] - self.plain(k, alpha, 0))
+    }
+
+    /// Row α of base coordinate `k`, column γ of the joint.
+    #[inline(always)]
+    pub fn base_row(&self, k: usize, alpha: usize, gamma: usize) -> f64 {
+        let plain = self.mirrored(k, alpha, gamma);
+        if alpha > 0 {
+            return plain;
+        }
+        plain + (self.impulses[gamma / LANES][k].0[gamma % LANES] - self.mirrored(k, self.s, gamma))
+    }
+
+    #[inline(always)]
+    fn plain(&self, k: usize, alpha: usize, gamma: usize) -> f64 {
+        self.blocks[(k * (self.s + 1) + alpha) * self.groups + gamma / LANES].0[gamma % LANES]
+    }
+
+    #[inline(always)]
+    fn mirrored(&self, k: usize, alpha: usize, gamma: usize) -> f64 {
+        if self.mirror.is_empty() {
+            return self.plain(k, gamma, alpha);
+        }
+        self.mirror[(k * (self.s + 1) + alpha) * self.groups + gamma / LANES].0[gamma % LANES]
     }
 }
 
@@ -423,8 +500,10 @@ fn composites<S: Simd>(
             let (h, j) = own_inertia(simd, constants, &del.bodies[at]);
             hessian.composites[at] = CompositeLanes { first_moment: store(h), rotational: store(j) };
             if !tree.is_base(i) {
-                hessian.columns[tree.joint_dof(i) * groups + g] =
-                    ColumnLanes { twist: del.bodies[at].joint_twist, rate: del.bodies[at].joint_twist_rate };
+                // By registers: the compiler calls a function to copy structures of this size.
+                let column = &mut hessian.columns[tree.joint_dof(i) * groups + g];
+                column.twist = store(load(simd, &del.bodies[at].joint_twist));
+                column.rate = store(load(simd, &del.bodies[at].joint_twist_rate));
             }
         }
     }
@@ -441,9 +520,9 @@ fn composites<S: Simd>(
         }
         for g in 0..groups {
             let (at, to) = (i * groups + g, parent * groups + g);
-            let own = hessian.composites[at];
-            accumulate(simd, &mut hessian.composites[to].first_moment, &own.first_moment);
-            accumulate(simd, &mut hessian.composites[to].rotational, &own.rotational);
+            let (parents, own) = hessian.composites.split_at_mut(at);
+            accumulate(simd, &mut parents[to].first_moment, &own[0].first_moment);
+            accumulate(simd, &mut parents[to].rotational, &own[0].rotational);
             if !del.loads.is_empty() {
                 let own = hessian.dead[at];
                 accumulate(simd, &mut hessian.dead[to].arm_cross, &own.arm_cross);
@@ -584,8 +663,12 @@ struct PairTerms<const G: usize> {
 }
 
 impl<const G: usize> PairTerms<G> {
-    const ZERO: Self =
-        Self { mass: [Quad::ZERO; G], stiffness: [Quad::ZERO; G], row: [Quad::ZERO; G], column: [Quad::ZERO; G] };
+    const ZERO: Self = Self {
+        mass: [Quad::ZERO; G],
+        stiffness: [Quad::ZERO; G],
+        row: [Quad::ZERO; G],
+        column: [Quad::ZERO; G],
+    };
 }
 
 const MAX_GROUPS: usize = (crate::lobatto::MAX_UNKNOWN_NODES + LANES) / LANES;
@@ -603,18 +686,49 @@ fn mix<S: Simd, const G: usize>(
     for alpha in 0..=s {
         for g in 0..groups {
             let at = alpha * groups + g;
-            let row = Lane::splat(simd, terms.row[alpha / LANES].0[alpha % LANES]);
-            let mut sum = row * Lane::load(simd, &tables.row[at]);
+            let mut sum = mixed_momenta(simd, tables, terms, s, groups, alpha, g);
             sum = Lane::load(simd, &terms.column[g]).mul_add(Lane::load(simd, &tables.column[at]), sum);
             sum = Lane::load(simd, &terms.stiffness[g]).mul_add(Lane::load(simd, &tables.unit[at]), sum);
-            for beta in 0..=s {
-                let mass = Lane::splat(simd, terms.mass[beta / LANES].0[beta % LANES]);
-                let table = &tables.mass[(beta * (s + 1) + alpha) * groups + g];
-                sum = mass.mul_add(Lane::load(simd, table), sum);
-            }
             out[at] = sum.quad();
         }
     }
+}
+
+/// [`mix`] of a pair without stiffness and `K_q̇q`.
+#[inline(always)]
+fn mix_momenta<S: Simd, const G: usize>(
+    simd: S,
+    tables: &Tables<'_>,
+    terms: &PairTerms<G>,
+    s: usize,
+    groups: usize,
+    out: &mut [Quad],
+) {
+    for alpha in 0..=s {
+        for g in 0..groups {
+            out[alpha * groups + g] = mixed_momenta(simd, tables, terms, s, groups, alpha, g).quad();
+        }
+    }
+}
+
+#[inline(always)]
+fn mixed_momenta<S: Simd, const G: usize>(
+    simd: S,
+    tables: &Tables<'_>,
+    terms: &PairTerms<G>,
+    s: usize,
+    groups: usize,
+    alpha: usize,
+    g: usize,
+) -> Lane<S> {
+    let row = Lane::splat(simd, terms.row[alpha / LANES].0[alpha % LANES]);
+    let mut sum = row * Lane::load(simd, &tables.row[alpha * groups + g]);
+    for beta in 0..=s {
+        let mass = Lane::splat(simd, terms.mass[beta / LANES].0[beta % LANES]);
+        let table = &tables.mass[(beta * (s + 1) + alpha) * groups + g];
+        sum = mass.mul_add(Lane::load(simd, table), sum);
+    }
+    sum
 }
 
 struct Tables<'a> {
@@ -654,7 +768,14 @@ fn joint_pairs<S: Simd, const G: usize>(
     };
     let block = (s + 1) * groups;
     let first_pair = hessian.pair_starts[i];
-    for (position, &dof) in tree.branch(i).iter().enumerate() {
+    // Six columns at once, unless wrenches without a potential ask for all terms.
+    let mut done = 0;
+    if tree.is_floating() && hessian.general.is_empty() {
+        let at = first_pair * block..(first_pair + 6) * block;
+        base_pairs_of_joint::<S, G>(simd, del, &rows, &tables, s, groups, &mut hessian.blocks[at]);
+        done = 6;
+    }
+    for (position, &dof) in tree.branch(i).iter().enumerate().skip(done) {
         let j = dof as usize;
         let (mut terms, mut mirror) = (PairTerms::<G>::ZERO, PairTerms::<G>::ZERO);
         for g in 0..groups {
@@ -692,6 +813,45 @@ fn joint_pairs<S: Simd, const G: usize>(
         mix(simd, &tables, &terms, s, groups, &mut hessian.blocks[at..at + block]);
         if !hessian.mirror.is_empty() {
             mix(simd, &tables, &mirror, s, groups, &mut hessian.mirror[at..at + block]);
+        }
+    }
+}
+
+/// The pairs of a joint with the six base coordinates: products with the columns of `S` and `Ṡ` are projections on the base. Columns of a
+/// travel of the chart have no angular part and no rate: only `K_q̇q̇` and `K_qq̇` are left of them.
+#[inline(always)]
+fn base_pairs_of_joint<S: Simd, const G: usize>(
+    simd: S,
+    del: &DelWorkspace,
+    rows: &[RowLanes; G],
+    tables: &Tables<'_>,
+    s: usize,
+    groups: usize,
+    blocks: &mut [Quad],
+) {
+    let mut terms = [PairTerms::<G>::ZERO; 6];
+    for g in 0..groups {
+        let base = &del.base[g];
+        let (a, b): (Lane6<S>, Lane6<S>) = (load(simd, &rows[g].a), load(simd, &rows[g].b));
+        let (mass, mass_rate) = base_project_both(simd, base, a);
+        let (row, rate) = base_project_both(simd, base, b);
+        let fixed = mat_tr_vec(&load(simd, &base.z), load(simd, &rows[g].c));
+        let step = Lane::load(simd, &del.weights[g]);
+        for k in 0..6 {
+            terms[k].mass[g] = mass[k].quad();
+            terms[k].row[g] = row[k].quad();
+        }
+        for k in 0..3 {
+            terms[k].column[g] = mass_rate[k].quad();
+            terms[k].stiffness[g] = (step * (rate[k] + fixed[k])).quad();
+        }
+    }
+    let block = (s + 1) * groups;
+    for (k, out) in blocks.chunks_exact_mut(block).enumerate() {
+        if k < 3 {
+            mix(simd, tables, &terms[k], s, groups, out);
+        } else {
+            mix_momenta(simd, tables, &terms[k], s, groups, out);
         }
     }
 }

@@ -8,7 +8,7 @@ use alloc::vec::Vec;
 use crate::del_hessian::DelHessian;
 use crate::del_residual::DelWorkspace;
 use crate::errors::FactorError;
-use crate::newton_direction::{BaseEntries, NewtonDirection, write_base_entries};
+use crate::newton_direction::{NewtonDirection, base_block};
 use crate::row_matrix::RowMatrix;
 use crate::tree::KinematicTree;
 
@@ -149,34 +149,25 @@ impl DenseNewton {
             }
         }
         if base > 0 {
-            write_base_entries(tree, del, &self.hessian, s, DenseTarget { entries, order, s });
+            for i in tree.first_joint_body()..tree.body_count() {
+                let dof = tree.joint_dof(i);
+                let joint = self.hessian.joint_and_base(i, dof, s, self.hessian.groups);
+                for k in 0..6 {
+                    for alpha in 0..s {
+                        for gamma in 1..=s {
+                            entries[(dof * s + alpha) * order + k * s + gamma - 1] =
+                                joint.joint_row(k, alpha, gamma);
+                            entries[(k * s + alpha) * order + dof * s + gamma - 1] =
+                                joint.base_row(k, alpha, gamma);
+                        }
+                    }
+                }
+            }
+            base_block(del, &self.hessian, s, |[row, alpha], [column, gamma], value| {
+                entries[(row * s + alpha) * order + column * s + gamma] = value;
+            });
         }
         &self.lu.entries
-    }
-}
-
-struct DenseTarget<'a> {
-    entries: &'a mut [f64],
-    order: usize,
-    s: usize,
-}
-
-impl BaseEntries for DenseTarget<'_> {
-    fn add_to_last_base_columns(&mut self, dof: usize, alpha: usize, changes: [f64; 6]) {
-        let row = &mut self.entries[(dof * self.s + alpha) * self.order..];
-        for (k, change) in changes.into_iter().enumerate() {
-            row[k * self.s + self.s - 1] += change;
-        }
-    }
-
-    fn add_to_first_base_rows(&mut self, dof: usize, gamma: usize, changes: [f64; 6]) {
-        for (k, change) in changes.into_iter().enumerate() {
-            self.entries[k * self.s * self.order + dof * self.s + gamma] += change;
-        }
-    }
-
-    fn set_base(&mut self, [row, alpha]: [usize; 2], [column, gamma]: [usize; 2], value: f64) {
-        self.entries[(row * self.s + alpha) * self.order + column * self.s + gamma] = value;
     }
 }
 

@@ -119,45 +119,18 @@ impl NewtonDirection for NewtonSolver {
     }
 }
 
-/// Where the rows and columns of a floating base go: a dense matrix or the panels of the branch LU, filled with `H[α,γ]` before.
-/// Nodes count from 0 in rows (`α`) and in columns (`γ - 1`).
-pub(crate) trait BaseEntries {
-    /// Row `(dof, alpha)` of a joint, the six base columns of the last node.
-    fn add_to_last_base_columns(&mut self, dof: usize, alpha: usize, changes: [f64; 6]);
-    /// The six base rows of node 0, column `(dof, gamma)` of a joint.
-    fn add_to_first_base_rows(&mut self, dof: usize, gamma: usize, changes: [f64; 6]);
-    /// A base-base entry, `[coordinate, node]` of row and column.
-    fn set_base(&mut self, row: [usize; 2], column: [usize; 2], value: f64);
-}
-
-/// Everything in the Newton matrix of a floating tree that is not plainly `H[α,γ]` (module doc of [`crate::del_hessian`]).
-/// `s` is the number of unknown nodes (a constant where the caller wants the loops unrolled).
+/// The base-base entries of the Newton matrix of a floating tree (module doc of [`crate::del_hessian`]): calls
+/// `set([coordinate, α], [coordinate, γ - 1], value)`, row first. `s` is the number of unknown nodes (a constant where the caller wants
+/// the loops unrolled).
 #[inline(always)]
-pub(crate) fn write_base_entries(
-    tree: &KinematicTree,
+pub(crate) fn base_block(
     del: &DelWorkspace,
     hessian: &DelHessian,
     s: usize,
-    mut target: impl BaseEntries,
+    mut set: impl FnMut([usize; 2], [usize; 2], f64),
 ) {
     let start_twists = base_matrix(del, 0);
     let end_twists = base_matrix(del, s);
-
-    for i in 1..tree.body_count() {
-        let dof = tree.joint_dof(i);
-        let first_pair = hessian.pair_starts[i];
-        for alpha in 0..s {
-            let shifts = hessian.shift_on_base(dof, alpha);
-            let changes = core::array::from_fn(|k| shifts[k] - hessian.entry(first_pair + k, alpha, 0));
-            target.add_to_last_base_columns(dof, alpha, changes);
-        }
-        for gamma in 1..=s {
-            let impulses = hessian.impulse_on_base(dof, gamma);
-            let changes =
-                core::array::from_fn(|k| impulses[k] - hessian.mirrored(first_pair + k, s, gamma));
-            target.add_to_first_base_rows(dof, gamma - 1, changes);
-        }
-    }
 
     // Change of the total impulse by δξ^s through the rigid shift S^0 δξ^s and through δξ^0 = -δξ^s.
     let mut shifted_impulse = Matrix6::from_fn(|r, k| -hessian.impulse_column(k, 0)[r]);
@@ -183,7 +156,7 @@ pub(crate) fn write_base_entries(
                     if gamma == s {
                         value += shifts[l] - hessian.base_entry(k, l, alpha, 0);
                     }
-                    target.set_base([k, alpha], [l, gamma - 1], value);
+                    set([k, alpha], [l, gamma - 1], value);
                 }
             }
         }
@@ -192,14 +165,14 @@ pub(crate) fn write_base_entries(
         for gamma in 1..=s {
             let impulses = hessian.impulse_on_base(l, gamma);
             for k in 0..6 {
-                let mut value = hessian.base_entry(k, l, 0, gamma) - hessian.base_entry(k, l, s, gamma)
-                    + impulses[k];
+                let mut value =
+                    hessian.base_entry(k, l, 0, gamma) - hessian.base_entry(k, l, s, gamma) + impulses[k];
                 if gamma == s {
                     value += last_column[(k, l)] + hessian.shift_on_base(k, 0)[l]
                         - hessian.shift_on_base(k, s)[l]
                         - (hessian.base_entry(k, l, 0, 0) - hessian.base_entry(k, l, s, 0));
                 }
-                target.set_base([k, 0], [l, gamma - 1], value);
+                set([k, 0], [l, gamma - 1], value);
             }
         }
     }

@@ -59,7 +59,8 @@ fn eliminate<S: Simd, const N: usize>(simd: S, lu: &mut BranchLu, s: usize) -> R
         unpack_negated(own_rows, above, s, false);
         unpack_negated(own_columns, below, s, true);
         let blocks = above.chunks_exact(block_size).zip(below.chunks_exact(block_size));
-        for (place, (&a, (above, below))) in ancestors.iter().zip(blocks).enumerate() {
+        // The parent first: its pivot is wanted next.
+        for (place, (&a, (above, below))) in ancestors.iter().zip(blocks).enumerate().rev() {
             let a = a as usize;
             let size = s * panel_quads(place + 1, s);
             let rows = &mut earlier_rows[lu.row_starts[a]..lu.row_starts[a] + size];

@@ -2,7 +2,6 @@
 
 use crate::del_hessian::DelHessian;
 use crate::lanes::{LANES, Quad};
-use crate::newton_direction::BaseEntries;
 
 /// Where the blocks of a joint go.
 pub(super) struct JointPanels<'a> {
@@ -82,49 +81,6 @@ fn fill_any(panels: JointPanels<'_>, s: usize) {
                     columns[at / LANES * s + gamma].0[at % LANES] = hessian.mirrored(pair, alpha, gamma + 1);
                 }
             }
-        }
-    }
-}
-
-/// The panels as target of the rows and columns of a floating base. The place of a base coordinate on every branch is its number.
-pub(super) struct PanelTarget<'a> {
-    pub rows: &'a mut [Quad],
-    pub columns: &'a mut [Quad],
-    pub row_starts: &'a [usize],
-    pub column_starts: &'a [usize],
-    pub s: usize,
-}
-
-impl BaseEntries for PanelTarget<'_> {
-    #[inline(always)]
-    fn add_to_last_base_columns(&mut self, dof: usize, alpha: usize, changes: [f64; 6]) {
-        let s = self.s;
-        let panel = &mut self.rows[self.row_starts[dof]..self.row_starts[dof + 1]];
-        for (k, change) in changes.into_iter().enumerate() {
-            let at = k * s + s - 1;
-            panel[at / LANES * s + alpha].0[at % LANES] += change;
-        }
-    }
-
-    #[inline(always)]
-    fn add_to_first_base_rows(&mut self, dof: usize, gamma: usize, changes: [f64; 6]) {
-        let s = self.s;
-        let panel = &mut self.columns[self.column_starts[dof]..self.column_starts[dof + 1]];
-        for (k, change) in changes.into_iter().enumerate() {
-            let at = k * s;
-            panel[at / LANES * s + gamma].0[at % LANES] += change;
-        }
-    }
-
-    #[inline(always)]
-    fn set_base(&mut self, [row, alpha]: [usize; 2], [column, gamma]: [usize; 2], value: f64) {
-        let s = self.s;
-        if column > row {
-            let at = row * s + alpha;
-            self.columns[self.column_starts[column] + at / LANES * s + gamma].0[at % LANES] = value;
-        } else {
-            let at = column * s + gamma;
-            self.rows[self.row_starts[row] + at / LANES * s + alpha].0[at % LANES] = value;
         }
     }
 }
