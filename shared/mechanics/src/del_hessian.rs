@@ -212,6 +212,18 @@ impl DelHessian {
         &self.blocks[self.pair_starts[body] * block..self.pair_starts[body + 1] * block]
     }
 
+    /// The blocks of a body's pairs, root first, itself last. `s` may be a constant.
+    #[inline(always)]
+    pub(crate) fn body_pairs(&self, body: usize, s: usize) -> impl Iterator<Item = PairBlock<'_>> {
+        let groups = (s + LANES) / LANES;
+        let block = (s + 1) * groups;
+        let quads = self.pair_starts[body] * block..self.pair_starts[body + 1] * block;
+        let symmetric = self.mirror.is_empty();
+        let mirror = if symmetric { &self.blocks } else { &self.mirror };
+        let pairs = self.blocks[quads.clone()].chunks_exact(block).zip(mirror[quads].chunks_exact(block));
+        pairs.map(move |(own, mirror)| PairBlock { own, mirror, symmetric, groups })
+    }
+
     /// `H[α,γ]` for the joint coordinate of `body` (row) and coordinate `position` of its branch (column).
     #[inline(always)]
     pub(crate) fn entry(&self, pair: usize, alpha: usize, gamma: usize) -> f64 {
@@ -311,6 +323,32 @@ fn lane(quads: &[Quad; 6], node: usize) -> [f64; 6] {
         out[k] = quads[k].0[node % LANES];
     }
     out
+}
+
+/// `H` of one pair of coordinates.
+#[derive(Clone, Copy)]
+pub(crate) struct PairBlock<'a> {
+    own: &'a [Quad],
+    mirror: &'a [Quad],
+    symmetric: bool,
+    groups: usize,
+}
+
+impl PairBlock<'_> {
+    /// `H[α,γ]` with the joint of the body as row.
+    #[inline(always)]
+    pub fn entry(&self, alpha: usize, gamma: usize) -> f64 {
+        self.own[alpha * self.groups + gamma / LANES].0[gamma % LANES]
+    }
+
+    /// `H[α,γ]` with the branch coordinate as row.
+    #[inline(always)]
+    pub fn mirrored(&self, alpha: usize, gamma: usize) -> f64 {
+        if self.symmetric {
+            return self.entry(gamma, alpha);
+        }
+        self.mirror[alpha * self.groups + gamma / LANES].0[gamma % LANES]
+    }
 }
 
 /// The Newton matrix between a joint and the base: `H` with the column rule of the module doc.

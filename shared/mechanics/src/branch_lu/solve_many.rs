@@ -64,12 +64,12 @@ impl Kernel for ForwardMany<'_> {
 /// Leaves to root. Columns of the linearisation are zero outside a subtree: those rows are skipped.
 #[inline(always)]
 fn forward<S: Simd, const N: usize>(simd: S, lu: &mut BranchLu, rhs: &mut RowMatrix, s: usize) {
-    let stride = rhs.stride();
-    let data = rhs.quads_mut();
+    let stride = rhs.stride() / WIDE;
+    let data = rhs.pieces_mut();
     let Relatives { descendants, starts, occupied } = &mut lu.relatives;
-    for at in (0..stride).step_by(WIDE) {
+    for at in 0..stride {
         for dof in (0..occupied.len()).rev() {
-            let mut sums = start_sums::<S, N>(simd, data, dof * s * stride + at, stride, s);
+            let mut sums = start_sums::<S, N, 1>(simd, data, dof * s * stride + at, stride, s);
             let mut empty = true;
             for &[i, pair] in &descendants[starts[dof]..starts[dof + 1]] {
                 if occupied[i as usize] {
@@ -80,7 +80,7 @@ fn forward<S: Simd, const N: usize>(simd: S, lu: &mut BranchLu, rhs: &mut RowMat
             }
             let x = total(simd, &sums, s);
             if empty {
-                for row in x.iter().take(s) {
+                for [row] in x.iter().take(s) {
                     empty &= row.is_zero();
                 }
             }
@@ -92,56 +92,73 @@ fn forward<S: Simd, const N: usize>(simd: S, lu: &mut BranchLu, rhs: &mut RowMat
             for alpha in 0..s {
                 let mut y = WideLane::splat(simd, 0.0);
                 for k in 0..s {
-                    y = WideLane::splat(simd, inverse[alpha * s + k]).mul_add(x[k], y);
+                    y = WideLane::splat(simd, inverse[alpha * s + k]).mul_add(x[k][0], y);
                 }
-                y.store(data, (dof * s + alpha) * stride + at);
+                data[(dof * s + alpha) * stride + at] = y.quads();
             }
         }
     }
 }
 
-/// The rows at `first` as accumulators, one per row and column of a block: the products of a block do not wait for each other.
+/// `W` pieces of the rows at `first` as accumulators, one per row and column of a block: the products of a block do not wait for each
+/// other.
 #[inline(always)]
-fn start_sums<S: Simd, const N: usize>(
+fn start_sums<S: Simd, const N: usize, const W: usize>(
     simd: S,
-    data: &[Quad],
+    data: &[[Quad; WIDE]],
     first: usize,
     stride: usize,
     s: usize,
-) -> [[WideLane<S>; N]; N] {
-    let mut sums = [[WideLane::splat(simd, 0.0); N]; N];
+) -> [[[WideLane<S>; W]; N]; N] {
+    let mut sums = [[[WideLane::splat(simd, 0.0); W]; N]; N];
     for alpha in 0..s {
-        sums[0][alpha] = WideLane::load(simd, data, first + alpha * stride);
+        let row = &data[first + alpha * stride..][..W];
+        for w in 0..W {
+            sums[0][alpha][w] = WideLane::of(simd, &row[w]);
+        }
     }
     sums
 }
 
 /// `sums += block y` for the rows `y` at `from`.
 #[inline(always)]
-fn add_block<S: Simd, const N: usize>(
+fn add_block<S: Simd, const N: usize, const W: usize>(
     simd: S,
-    sums: &mut [[WideLane<S>; N]; N],
+    sums: &mut [[[WideLane<S>; W]; N]; N],
     block: &[f64],
-    data: &[Quad],
+    data: &[[Quad; WIDE]],
     from: usize,
     stride: usize,
     s: usize,
 ) {
     for k in 0..s {
-        let y = WideLane::load(simd, data, from + k * stride);
+        let row = &data[from + k * stride..][..W];
+        let mut y = [WideLane::splat(simd, 0.0); W];
+        for w in 0..W {
+            y[w] = WideLane::of(simd, &row[w]);
+        }
         for alpha in 0..s {
-            sums[k][alpha] = WideLane::splat(simd, block[alpha * s + k]).mul_add(y, sums[k][alpha]);
+            let factor = WideLane::splat(simd, block[alpha * s + k]);
+            for w in 0..W {
+                sums[k][alpha][w] = factor.mul_add(y[w], sums[k][alpha][w]);
+            }
         }
     }
 }
 
 #[inline(always)]
-fn total<S: Simd, const N: usize>(simd: S, sums: &[[WideLane<S>; N]; N], s: usize) -> [WideLane<S>; N] {
+fn total<S: Simd, const N: usize, const W: usize>(
+    simd: S,
+    sums: &[[[WideLane<S>; W]; N]; N],
+    s: usize,
+) -> [[WideLane<S>; W]; N] {
     let one = WideLane::splat(simd, 1.0);
     let mut out = sums[0];
     for k in 1..s {
         for alpha in 0..s {
-            out[alpha] = one.mul_add(sums[k][alpha], out[alpha]);
+            for w in 0..W {
+                out[alpha][w] = one.mul_add(sums[k][alpha][w], out[alpha][w]);
+            }
         }
     }
     out
@@ -169,18 +186,38 @@ impl Kernel for BackwardMany<'_> {
 /// Root to leaves.
 #[inline(always)]
 fn backward<S: Simd, const N: usize>(simd: S, lu: &BranchLu, rhs: &mut RowMatrix, s: usize) {
-    let stride = rhs.stride();
-    let data = rhs.quads_mut();
-    for at in (0..stride).step_by(WIDE) {
-        for dof in 0..lu.ancestor_starts.len() - 1 {
-            let pairs = lu.ancestor_starts[dof]..lu.ancestor_starts[dof + 1];
-            let blocks = &lu.above[pairs.start * s * s..pairs.end * s * s];
-            let mut sums = start_sums::<S, N>(simd, data, dof * s * stride + at, stride, s);
-            for (&b, block) in lu.ancestors[pairs].iter().zip(blocks.chunks_exact(s * s)) {
-                add_block(simd, &mut sums, block, data, b as usize * s * stride + at, stride, s);
-            }
-            for (alpha, row) in total(simd, &sums, s).into_iter().enumerate().take(s) {
-                row.store(data, (dof * s + alpha) * stride + at);
+    let stride = rhs.stride() / WIDE;
+    let data = rhs.pieces_mut();
+    let mut at = 0;
+    while S::WIDES == 2 && at + 2 <= stride {
+        backward_at::<S, N, 2>(simd, lu, data, at, stride, s);
+        at += 2;
+    }
+    for at in at..stride {
+        backward_at::<S, N, 1>(simd, lu, data, at, stride, s);
+    }
+}
+
+/// `W` pieces of the columns from `at` on.
+#[inline(always)]
+fn backward_at<S: Simd, const N: usize, const W: usize>(
+    simd: S,
+    lu: &BranchLu,
+    data: &mut [[Quad; WIDE]],
+    at: usize,
+    stride: usize,
+    s: usize,
+) {
+    for dof in 0..lu.ancestor_starts.len() - 1 {
+        let pairs = lu.ancestor_starts[dof]..lu.ancestor_starts[dof + 1];
+        let blocks = &lu.above[pairs.start * s * s..pairs.end * s * s];
+        let mut sums = start_sums::<S, N, W>(simd, data, dof * s * stride + at, stride, s);
+        for (&b, block) in lu.ancestors[pairs].iter().zip(blocks.chunks_exact(s * s)) {
+            add_block(simd, &mut sums, block, data, b as usize * s * stride + at, stride, s);
+        }
+        for (alpha, row) in total(simd, &sums, s).into_iter().enumerate().take(s) {
+            for (piece, y) in data[(dof * s + alpha) * stride + at..].iter_mut().zip(row) {
+                *piece = y.quads();
             }
         }
     }
