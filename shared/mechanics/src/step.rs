@@ -15,8 +15,8 @@
 //!
 //! **Iteration.** `J` is factorised once and kept while the iteration contracts (simplified Newton), also over the steps that
 //! continue the motion and after a linearisation: it changes by `O(Δt)` from step to step, and a factorisation costs as much as
-//! two or three iterations. When old factors take more iterations than new ones are worth (light links at high accelerations), the next
-//! sixteen steps make new ones. Broyden's update on top of the factors costs a few scalar products and saves about one iteration. `J`
+//! two or three iterations. When old factors take more iterations than new ones are worth, the next step makes new ones; when
+//! they do not contract (light links at high accelerations), the next sixteen do. Broyden's update on top of the factors costs a few scalar products and saves about one iteration. `J`
 //! is renewed when `θ` exceeds 0.1. A change may be limited to [`StepOptions::change_limit`] in the largest angle, a trust region
 //! without a merit function: on a 32-link chain at steps of 40 ms (trapezoidal, random states, `tests/paper`) it raises the share of
 //! solved steps from 0.5 to 0.9.
@@ -24,7 +24,7 @@
 //! **Stop.** On the change, never on the residual: its floor `~10 ε max|a^{αβ} Sᵀμ|` grows with the length of the chain. Done
 //! when the next change is predicted below [`StepOptions::accuracy`] times `1 + max|q|`, by default 1e-16: what is left of it accumulates in the momenta over many steps
 //! (stopping at 1e-14 left 1e-10 in an exactly conserved momentum after 500 steps). With old factors the prediction is linear in the
-//! change; with the factors of the guess the second change is as the square of the first, and their ratio in an earlier step, times ten
+//! change, and when round-off hides a contraction, those before it count; with the factors of the guess the second change is as the square of the first, and their ratio in an earlier step, times ten
 //! for safety, may end the iteration at the first. Or when the change is below `1e-8` and no longer shrinks: round-off.
 //!
 //! Source: the paper, section 3.2 (there `δq = -J r`; the inverse is missing in print); Broyden's method in the form of
@@ -55,7 +55,8 @@ const STAGNATION_CHANGE: f64 = 1e-8;
 const RENEW_CONTRACTION: f64 = 0.1;
 /// Iterations that cost as much as a factorisation: the factors of an earlier step may take this many more than new ones.
 const FACTOR_ITERATIONS: usize = 2;
-/// When they take more, this many steps begin with new factors before old ones are tried again.
+/// When they do not contract, this many steps begin with new factors before old ones are tried again; when they only take more
+/// iterations, one.
 const REUSE_PAUSE: u32 = 16;
 /// The ratio of the last step may have grown by this much when it predicts the second change of this one.
 const SAFETY: f64 = 10.0;
@@ -576,6 +577,9 @@ impl Integrator {
             // Old factors contract unevenly: the worse of two contractions counts, and a poor one is no sign of round-off.
             let old = old_factors && !renewed;
             let rate = if old { contraction.max(last_contraction) } else { contraction };
+            // What is left by the contractions before this one, should round-off hide how much this change is smaller than the last.
+            let left = last_change * last_contraction * last_contraction;
+            let hidden = old && iteration > 1 && change < STAGNATION_CHANGE * size;
             let small = if old { self.options.accuracy } else { SMALL_CHANGE.max(self.options.accuracy) };
             // Newton's method with the matrix of the guess: the second change is as the square of the first.
             let fresh = renewed && !limited && report.factorizations == factorizations + 1;
@@ -586,6 +590,7 @@ impl Integrator {
             if change <= small * size
                 || (fresh && iteration == 0 && predicted <= self.options.accuracy * size)
                 || (iteration > 0 && change * rate <= self.options.accuracy * size)
+                || (hidden && left <= self.options.accuracy * size)
                 || (!old && change < STAGNATION_CHANGE * size && contraction > 0.5)
             {
                 self.del.evaluate(tree, forces.laws);
@@ -593,8 +598,10 @@ impl Integrator {
                     if self.known_missed > 0 {
                         self.new_factor_iterations = iteration + 1;
                     }
-                } else if renewed || iteration + 1 > self.new_factor_iterations + FACTOR_ITERATIONS {
+                } else if renewed {
                     self.reuse_pause = REUSE_PAUSE;
+                } else if iteration + 1 > self.new_factor_iterations + FACTOR_ITERATIONS {
+                    self.reuse_pause = 1;
                 }
                 return Ok(());
             }

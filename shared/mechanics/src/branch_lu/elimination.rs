@@ -47,7 +47,7 @@ fn eliminate<S: Simd, const N: usize>(simd: S, lu: &mut BranchLu, s: usize) -> R
         let own_rows = &mut own_rows[..s * panel_quads(ancestors.len(), s)];
         let own_columns = &own_columns[..own_rows.len()];
         scale_rows(simd, own_rows, &inverse, s);
-        if diagonal % LANES != 0 {
+        if !diagonal.is_multiple_of(LANES) {
             // What stands behind the ancestors must not reach the scalar products of the solves.
             let last = own_rows.len() - s;
             for quad in &mut own_rows[last..] {
