@@ -49,9 +49,9 @@ use crate::tree::KinematicTree;
 
 /// Mean length of the branches above which the recursion over columns beats the matrix path, for s = 1, 2, 3 and more.
 ///
-/// Measured with `benches/crossover.rs` (Xeon with AVX-512; chains and stars of 8 to 125 links): equal at 15 to 22 for s = 1, 9 to 13 for
-/// s = 2, 16 to 20 for s = 3. Atlas on its foot has 9.8.
-const CROSSOVER_LINEARIZATION: [f64; 3] = [18.0, 12.5, 18.0];
+/// Measured with `benches/crossover.rs` (Xeon with AVX-512; chains and stars of 8 to 125 links): equal at 14 to 18 for s = 2 and 20 to 30
+/// for s = 3; for s = 1 the matrix path takes two thirds of the recursion at 32, the deepest measured. Atlas on its foot has 9.8.
+const CROSSOVER_LINEARIZATION: [f64; 3] = [40.0, 16.0, 26.0];
 
 /// State of the linearised dynamics.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
