@@ -3,6 +3,8 @@
 //! `cargo bench -p delmpc-mechanics --bench floating_base` prints both times and their ratio, and fails when the chart-free step is the
 //! dearer one. The robot (30 joints, the foot of `atlas_v4_rfoot_s2.json` as base of 20 kg) tumbles freely; the same motion, step and
 //! Newton matrix for both; steps are measured in turns, the figures are the least of several medians.
+//!
+//! `.. -- --profile chart-free|virtual S REPEATS` only runs steps: for `valgrind --tool=callgrind`, to see where instructions go.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 #[path = "../tests/oracle/mod.rs"]
@@ -106,6 +108,17 @@ impl Run {
 
 fn main() -> ExitCode {
     let case = oracle::Case::new("atlas".into(), oracle::read("atlas_v4_rfoot_s2.json"));
+    let arguments: Vec<String> = std::env::args().skip(1).filter(|a| a != "--bench").collect();
+    if let [mode, form, s, repeats] = arguments.as_slice()
+        && mode == "--profile"
+    {
+        let tree = if form == "virtual" { virtual_joints(&case.tree) } else { chart_free(&case.tree) };
+        let mut run = Run::new(tree, NewtonMethod::BranchLu, s.parse().unwrap(), &case.state.q);
+        for _ in 0..repeats.parse().unwrap() {
+            run.stretch();
+        }
+        return ExitCode::SUCCESS;
+    }
     let mut kept = true;
     println!(
         "| s | chart-free, µs (iterations) | six virtual joints, µs (iterations) | ratio |\n|---|---|---|---|"

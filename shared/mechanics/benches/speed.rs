@@ -129,17 +129,23 @@ fn report(name: &str, tree: &KinematicTree, s: usize, dt: f64, q: &[f64], torque
             let solved = time(|| {
                 work.linearize(tree, &mut integrator).unwrap();
             });
-            let mut steps = 0;
+            let (mut steps, mut iterations, mut factorizations) = (0, 0, 0);
             let unsolved = time(|| {
                 if steps % 50 == 0 {
                     state.copy_from(&begun);
                     integrator.forget();
                 }
-                steps += 1;
-                integrator.step(tree, &mut state, &forces).unwrap();
+                let report = integrator.step(tree, &mut state, &forces).unwrap();
                 work.linearize(tree, &mut integrator).unwrap();
+                steps += 1;
+                iterations += report.iterations;
+                factorizations += report.factorizations;
             });
-            println!("    A, B in {coordinates:?}: solved step {solved:.2}, unsolved step {unsolved:.2} µs");
+            println!(
+                "    A, B in {coordinates:?}: solved step {solved:.2}, unsolved step {unsolved:.2} µs ({:.2} iterations, {:.2} factorisations before)",
+                iterations as f64 / f64::from(steps),
+                factorizations as f64 / f64::from(steps)
+            );
         }
         let mut work =
             Linearizer::new(tree, &integrator, StateCoordinates::Momentum, InputHold::Held).unwrap();

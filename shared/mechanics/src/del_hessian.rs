@@ -37,7 +37,7 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use crate::del_residual::{DelWorkspace, load_arm};
-use crate::floating_base::{BaseLanes, base_project, second_order, second_order_rate};
+use crate::floating_base::{BaseLanes, base_project, base_project_both, second_order, second_order_rate};
 use crate::gravity_hessian::gravity_column;
 use crate::kinetic_hessian::{CompositeLanes, composite_times, kinetic_columns, own_inertia};
 use crate::lanes::{
@@ -205,6 +205,25 @@ impl DelHessian {
         self.mirror.is_empty()
     }
 
+    /// Blocks of all pairs of a body, root first: `s + 1` rows of the lane groups each.
+    #[inline(always)]
+    pub(crate) fn body_blocks(&self, body: usize) -> &[Quad] {
+        let block = (self.s + 1) * self.groups;
+        &self.blocks[self.pair_starts[body] * block..self.pair_starts[body + 1] * block]
+    }
+
+    /// The blocks of a body's pairs, root first, itself last. `s` may be a constant.
+    #[inline(always)]
+    pub(crate) fn body_pairs(&self, body: usize, s: usize) -> impl Iterator<Item = PairBlock<'_>> {
+        let groups = (s + LANES) / LANES;
+        let block = (s + 1) * groups;
+        let quads = self.pair_starts[body] * block..self.pair_starts[body + 1] * block;
+        let symmetric = self.mirror.is_empty();
+        let mirror = if symmetric { &self.blocks } else { &self.mirror };
+        let pairs = self.blocks[quads.clone()].chunks_exact(block).zip(mirror[quads].chunks_exact(block));
+        pairs.map(move |(own, mirror)| PairBlock { own, mirror, symmetric, groups })
+    }
+
     /// `H[α,γ]` for the joint coordinate of `body` (row) and coordinate `position` of its branch (column).
     #[inline(always)]
     pub(crate) fn entry(&self, pair: usize, alpha: usize, gamma: usize) -> f64 {
@@ -239,16 +258,37 @@ impl DelHessian {
         self.impulse_columns[dof * self.groups + gamma / LANES].map(|q| q.0[gamma % LANES])
     }
 
-    /// `S^0ᵀ` of [`DelHessian::shift_row`], component `k`.
+    /// `S^0ᵀ` of [`DelHessian::shift_row`].
     #[inline(always)]
-    pub(crate) fn shift_on_base(&self, dof: usize, k: usize, alpha: usize) -> f64 {
-        self.shifts_on_base[dof * self.groups + alpha / LANES][k].0[alpha % LANES]
+    pub(crate) fn shift_on_base(&self, dof: usize, alpha: usize) -> [f64; 6] {
+        lane(&self.shifts_on_base[dof * self.groups + alpha / LANES], alpha)
     }
 
-    /// `S^sᵀ` of [`DelHessian::impulse_column`], component `k`.
+    /// `S^sᵀ` of [`DelHessian::impulse_column`].
     #[inline(always)]
-    pub(crate) fn impulse_on_base(&self, dof: usize, k: usize, gamma: usize) -> f64 {
-        self.impulses_on_base[dof * self.groups + gamma / LANES][k].0[gamma % LANES]
+    pub(crate) fn impulse_on_base(&self, dof: usize, gamma: usize) -> [f64; 6] {
+        lane(&self.impulses_on_base[dof * self.groups + gamma / LANES], gamma)
+    }
+
+    /// What a joint of a floating tree shares with the base. `s` and `groups` may be constants.
+    #[inline(always)]
+    pub(crate) fn joint_and_base(
+        &self,
+        body: usize,
+        dof: usize,
+        s: usize,
+        groups: usize,
+    ) -> JointAndBase<'_> {
+        let block = (s + 1) * groups;
+        let pairs = self.pair_starts[body] * block..(self.pair_starts[body] + 6) * block;
+        JointAndBase {
+            blocks: &self.blocks[pairs.clone()],
+            mirror: if self.mirror.is_empty() { &[] } else { &self.mirror[pairs] },
+            shifts: &self.shifts_on_base[dof * groups..(dof + 1) * groups],
+            impulses: &self.impulses_on_base[dof * groups..(dof + 1) * groups],
+            s,
+            groups,
+        }
     }
 
     /// `(𝒴 - ad^D_Γ)^α e_k` of the base, times `w_α Δt`.
@@ -275,6 +315,88 @@ impl DelHessian {
     }
 }
 
+/// One node of a 6-vector.
+#[inline(always)]
+fn lane(quads: &[Quad; 6], node: usize) -> [f64; 6] {
+    let mut out = [0.0; 6];
+    for k in 0..6 {
+        out[k] = quads[k].0[node % LANES];
+    }
+    out
+}
+
+/// `H` of one pair of coordinates.
+#[derive(Clone, Copy)]
+pub(crate) struct PairBlock<'a> {
+    own: &'a [Quad],
+    mirror: &'a [Quad],
+    symmetric: bool,
+    groups: usize,
+}
+
+impl PairBlock<'_> {
+    /// `H[α,γ]` with the joint of the body as row.
+    #[inline(always)]
+    pub fn entry(&self, alpha: usize, gamma: usize) -> f64 {
+        self.own[alpha * self.groups + gamma / LANES].0[gamma % LANES]
+    }
+
+    /// `H[α,γ]` with the branch coordinate as row.
+    #[inline(always)]
+    pub fn mirrored(&self, alpha: usize, gamma: usize) -> f64 {
+        if self.symmetric {
+            return self.entry(gamma, alpha);
+        }
+        self.mirror[alpha * self.groups + gamma / LANES].0[gamma % LANES]
+    }
+}
+
+/// The Newton matrix between a joint and the base: `H` with the column rule of the module doc.
+#[derive(Clone, Copy)]
+pub(crate) struct JointAndBase<'a> {
+    blocks: &'a [Quad],
+    mirror: &'a [Quad],
+    shifts: &'a [[Quad; 6]],
+    impulses: &'a [[Quad; 6]],
+    s: usize,
+    groups: usize,
+}
+
+impl JointAndBase<'_> {
+    /// Row α of the joint, column γ of base coordinate `k`.
+    #[inline(always)]
+    pub fn joint_row(&self, k: usize, alpha: usize, gamma: usize) -> f64 {
+        let plain = self.plain(k, alpha, gamma);
+        if gamma < self.s {
+            return plain;
+        }
+        plain + (self.shifts[alpha / LANES][k].0[alpha % LANES] - self.plain(k, alpha, 0))
+    }
+
+    /// Row α of base coordinate `k`, column γ of the joint.
+    #[inline(always)]
+    pub fn base_row(&self, k: usize, alpha: usize, gamma: usize) -> f64 {
+        let plain = self.mirrored(k, alpha, gamma);
+        if alpha > 0 {
+            return plain;
+        }
+        plain + (self.impulses[gamma / LANES][k].0[gamma % LANES] - self.mirrored(k, self.s, gamma))
+    }
+
+    #[inline(always)]
+    fn plain(&self, k: usize, alpha: usize, gamma: usize) -> f64 {
+        self.blocks[(k * (self.s + 1) + alpha) * self.groups + gamma / LANES].0[gamma % LANES]
+    }
+
+    #[inline(always)]
+    fn mirrored(&self, k: usize, alpha: usize, gamma: usize) -> f64 {
+        if self.mirror.is_empty() {
+            return self.plain(k, gamma, alpha);
+        }
+        self.mirror[(k * (self.s + 1) + alpha) * self.groups + gamma / LANES].0[gamma % LANES]
+    }
+}
+
 struct Assemble<'a> {
     tree: &'a KinematicTree,
     del: &'a DelWorkspace,
@@ -287,18 +409,19 @@ impl Kernel for Assemble<'_> {
     fn run<S: Simd>(self, simd: S) {
         // With constant arguments the loops over nodes unroll.
         match (self.hessian.s, self.hessian.groups) {
-            (1, 1) if S::SPECIALISE => assemble(simd, self, 1, 1),
-            (2, 1) if S::SPECIALISE => assemble(simd, self, 2, 1),
-            (s, groups) => assemble(simd, self, s, groups),
+            (1, 1) if S::SPECIALISE => assemble::<S, 1>(simd, self, 1, 1),
+            (2, 1) if S::SPECIALISE => assemble::<S, 1>(simd, self, 2, 1),
+            (3, 1) if S::SPECIALISE => assemble::<S, 1>(simd, self, 3, 1),
+            (s, groups) => assemble::<S, MAX_GROUPS>(simd, self, s, groups),
         }
     }
 }
 
 #[inline(always)]
-fn assemble<S: Simd>(simd: S, work: Assemble<'_>, s: usize, groups: usize) {
+fn assemble<S: Simd, const G: usize>(simd: S, work: Assemble<'_>, s: usize, groups: usize) {
     let Assemble { tree, del, hessian } = work;
     for i in tree.first_joint_body()..tree.body_count() {
-        joint_pairs(simd, tree, del, hessian, i, s, groups);
+        joint_pairs::<S, G>(simd, tree, del, hessian, i, s, groups);
     }
 }
 
@@ -340,9 +463,10 @@ impl Kernel for BasePairs<'_> {
         let (s, groups) = (hessian.s, hessian.groups);
         // With constant arguments the loops over nodes unroll.
         match (s, groups) {
-            (1, 1) if S::SPECIALISE => base_pairs(simd, tree, del, hessian, 1, 1),
-            (2, 1) if S::SPECIALISE => base_pairs(simd, tree, del, hessian, 2, 1),
-            (s, groups) => base_pairs(simd, tree, del, hessian, s, groups),
+            (1, 1) if S::SPECIALISE => base_pairs::<S, 1>(simd, tree, del, hessian, 1, 1),
+            (2, 1) if S::SPECIALISE => base_pairs::<S, 1>(simd, tree, del, hessian, 2, 1),
+            (3, 1) if S::SPECIALISE => base_pairs::<S, 1>(simd, tree, del, hessian, 3, 1),
+            (s, groups) => base_pairs::<S, MAX_GROUPS>(simd, tree, del, hessian, s, groups),
         }
         if !hessian.general.is_empty() {
             for i in 0..tree.body_count() {
@@ -414,8 +538,10 @@ fn composites<S: Simd>(
             let (h, j) = own_inertia(simd, constants, &del.bodies[at]);
             hessian.composites[at] = CompositeLanes { first_moment: store(h), rotational: store(j) };
             if !tree.is_base(i) {
-                hessian.columns[tree.joint_dof(i) * groups + g] =
-                    ColumnLanes { twist: del.bodies[at].joint_twist, rate: del.bodies[at].joint_twist_rate };
+                // By registers: the compiler calls a function to copy structures of this size.
+                let column = &mut hessian.columns[tree.joint_dof(i) * groups + g];
+                column.twist = store(load(simd, &del.bodies[at].joint_twist));
+                column.rate = store(load(simd, &del.bodies[at].joint_twist_rate));
             }
         }
     }
@@ -432,9 +558,9 @@ fn composites<S: Simd>(
         }
         for g in 0..groups {
             let (at, to) = (i * groups + g, parent * groups + g);
-            let own = hessian.composites[at];
-            accumulate(simd, &mut hessian.composites[to].first_moment, &own.first_moment);
-            accumulate(simd, &mut hessian.composites[to].rotational, &own.rotational);
+            let (parents, own) = hessian.composites.split_at_mut(at);
+            accumulate(simd, &mut parents[to].first_moment, &own[0].first_moment);
+            accumulate(simd, &mut parents[to].rotational, &own[0].rotational);
             if !del.loads.is_empty() {
                 let own = hessian.dead[at];
                 accumulate(simd, &mut hessian.dead[to].arm_cross, &own.arm_cross);
@@ -562,38 +688,85 @@ fn general_terms<S: Simd>(
 }
 
 /// Lanes of the pair terms, per group, before the nodes are mixed.
-#[derive(Clone, Copy, Default)]
-struct PairTerms {
+#[derive(Clone, Copy)]
+struct PairTerms<const G: usize> {
     /// `K_q̇q̇`.
-    mass: [Quad; MAX_GROUPS],
+    mass: [Quad; G],
     /// `w_α Δt (K_qq - V_qq + τ_q)`.
-    stiffness: [Quad; MAX_GROUPS],
+    stiffness: [Quad; G],
     /// `K_qq̇ + τ_q̇` of the row's own node.
-    row: [Quad; MAX_GROUPS],
+    row: [Quad; G],
     /// `K_q̇q`.
-    column: [Quad; MAX_GROUPS],
+    column: [Quad; G],
+}
+
+impl<const G: usize> PairTerms<G> {
+    const ZERO: Self = Self {
+        mass: [Quad::ZERO; G],
+        stiffness: [Quad::ZERO; G],
+        row: [Quad::ZERO; G],
+        column: [Quad::ZERO; G],
+    };
 }
 
 const MAX_GROUPS: usize = (crate::lobatto::MAX_UNKNOWN_NODES + LANES) / LANES;
 
 /// Mixes the nodes: the formula of the module doc for one pair.
 #[inline(always)]
-fn mix<S: Simd>(simd: S, tables: &Tables<'_>, terms: &PairTerms, s: usize, groups: usize, out: &mut [Quad]) {
+fn mix<S: Simd, const G: usize>(
+    simd: S,
+    tables: &Tables<'_>,
+    terms: &PairTerms<G>,
+    s: usize,
+    groups: usize,
+    out: &mut [Quad],
+) {
     for alpha in 0..=s {
         for g in 0..groups {
             let at = alpha * groups + g;
-            let row = Lane::splat(simd, terms.row[alpha / LANES].0[alpha % LANES]);
-            let mut sum = row * Lane::load(simd, &tables.row[at]);
+            let mut sum = mixed_momenta(simd, tables, terms, s, groups, alpha, g);
             sum = Lane::load(simd, &terms.column[g]).mul_add(Lane::load(simd, &tables.column[at]), sum);
             sum = Lane::load(simd, &terms.stiffness[g]).mul_add(Lane::load(simd, &tables.unit[at]), sum);
-            for beta in 0..=s {
-                let mass = Lane::splat(simd, terms.mass[beta / LANES].0[beta % LANES]);
-                let table = &tables.mass[(beta * (s + 1) + alpha) * groups + g];
-                sum = mass.mul_add(Lane::load(simd, table), sum);
-            }
             out[at] = sum.quad();
         }
     }
+}
+
+/// [`mix`] of a pair without stiffness and `K_q̇q`.
+#[inline(always)]
+fn mix_momenta<S: Simd, const G: usize>(
+    simd: S,
+    tables: &Tables<'_>,
+    terms: &PairTerms<G>,
+    s: usize,
+    groups: usize,
+    out: &mut [Quad],
+) {
+    for alpha in 0..=s {
+        for g in 0..groups {
+            out[alpha * groups + g] = mixed_momenta(simd, tables, terms, s, groups, alpha, g).quad();
+        }
+    }
+}
+
+#[inline(always)]
+fn mixed_momenta<S: Simd, const G: usize>(
+    simd: S,
+    tables: &Tables<'_>,
+    terms: &PairTerms<G>,
+    s: usize,
+    groups: usize,
+    alpha: usize,
+    g: usize,
+) -> Lane<S> {
+    let row = Lane::splat(simd, terms.row[alpha / LANES].0[alpha % LANES]);
+    let mut sum = row * Lane::load(simd, &tables.row[alpha * groups + g]);
+    for beta in 0..=s {
+        let mass = Lane::splat(simd, terms.mass[beta / LANES].0[beta % LANES]);
+        let table = &tables.mass[(beta * (s + 1) + alpha) * groups + g];
+        sum = mass.mul_add(Lane::load(simd, table), sum);
+    }
+    sum
 }
 
 struct Tables<'a> {
@@ -604,7 +777,7 @@ struct Tables<'a> {
 }
 
 #[inline(always)]
-fn joint_pairs<S: Simd>(
+fn joint_pairs<S: Simd, const G: usize>(
     simd: S,
     tree: &KinematicTree,
     del: &DelWorkspace,
@@ -616,7 +789,7 @@ fn joint_pairs<S: Simd>(
     let constants = &tree.constants()[i];
     let own = tree.joint_dof(i);
     let mass = constants.subtree_mass;
-    let mut rows = [RowLanes::default(); MAX_GROUPS];
+    let mut rows = [RowLanes::default(); G];
     for g in 0..groups {
         let at = i * groups + g;
         let body = &del.bodies[at];
@@ -633,9 +806,16 @@ fn joint_pairs<S: Simd>(
     };
     let block = (s + 1) * groups;
     let first_pair = hessian.pair_starts[i];
-    for (position, &dof) in tree.branch(i).iter().enumerate() {
+    // Six columns at once, unless wrenches without a potential ask for all terms.
+    let mut done = 0;
+    if tree.is_floating() && hessian.general.is_empty() {
+        let at = first_pair * block..(first_pair + 6) * block;
+        base_pairs_of_joint::<S, G>(simd, del, &rows, &tables, s, groups, &mut hessian.blocks[at]);
+        done = 6;
+    }
+    for (position, &dof) in tree.branch(i).iter().enumerate().skip(done) {
         let j = dof as usize;
-        let (mut terms, mut mirror) = (PairTerms::default(), PairTerms::default());
+        let (mut terms, mut mirror) = (PairTerms::<G>::ZERO, PairTerms::<G>::ZERO);
         for g in 0..groups {
             let column = &hessian.columns[j * groups + g];
             let twist: Lane6<S> = load(simd, &column.twist);
@@ -671,6 +851,45 @@ fn joint_pairs<S: Simd>(
         mix(simd, &tables, &terms, s, groups, &mut hessian.blocks[at..at + block]);
         if !hessian.mirror.is_empty() {
             mix(simd, &tables, &mirror, s, groups, &mut hessian.mirror[at..at + block]);
+        }
+    }
+}
+
+/// The pairs of a joint with the six base coordinates: products with the columns of `S` and `Ṡ` are projections on the base. Columns of a
+/// travel of the chart have no angular part and no rate: only `K_q̇q̇` and `K_qq̇` are left of them.
+#[inline(always)]
+fn base_pairs_of_joint<S: Simd, const G: usize>(
+    simd: S,
+    del: &DelWorkspace,
+    rows: &[RowLanes; G],
+    tables: &Tables<'_>,
+    s: usize,
+    groups: usize,
+    blocks: &mut [Quad],
+) {
+    let mut terms = [PairTerms::<G>::ZERO; 6];
+    for g in 0..groups {
+        let base = &del.base[g];
+        let (a, b): (Lane6<S>, Lane6<S>) = (load(simd, &rows[g].a), load(simd, &rows[g].b));
+        let (mass, mass_rate) = base_project_both(simd, base, a);
+        let (row, rate) = base_project_both(simd, base, b);
+        let fixed = mat_tr_vec(&load(simd, &base.z), load(simd, &rows[g].c));
+        let step = Lane::load(simd, &del.weights[g]);
+        for k in 0..6 {
+            terms[k].mass[g] = mass[k].quad();
+            terms[k].row[g] = row[k].quad();
+        }
+        for k in 0..3 {
+            terms[k].column[g] = mass_rate[k].quad();
+            terms[k].stiffness[g] = (step * (rate[k] + fixed[k])).quad();
+        }
+    }
+    let block = (s + 1) * groups;
+    for (k, out) in blocks.chunks_exact_mut(block).enumerate() {
+        if k < 3 {
+            mix(simd, tables, &terms[k], s, groups, out);
+        } else {
+            mix_momenta(simd, tables, &terms[k], s, groups, out);
         }
     }
 }
@@ -739,7 +958,7 @@ fn base_columns<S: Simd>(simd: S, base: &BaseLanes, hessian: &mut DelHessian, gr
 
 /// Base-base blocks, and the shift rows and impulse columns of the base.
 #[inline(always)]
-fn base_pairs<S: Simd>(
+fn base_pairs<S: Simd, const G: usize>(
     simd: S,
     tree: &KinematicTree,
     del: &DelWorkspace,
@@ -764,7 +983,7 @@ fn base_pairs<S: Simd>(
     let mass = tree.constants()[0].subtree_mass;
     let block = (s + 1) * groups;
     // N(μ), Ṅ(μ), N(Γ) of every group.
-    let mut curved = [[[Quad::ZERO; 18]; 3]; MAX_GROUPS];
+    let mut curved = [[[Quad::ZERO; 18]; 3]; G];
     for g in 0..groups {
         let (base, body) = (&del.base[g], &del.bodies[g]);
         let momentum = load(simd, &body.momentum);
@@ -775,10 +994,10 @@ fn base_pairs<S: Simd>(
         ];
     }
     // What a column brings to all its rows: 𝓜S, 𝓜Ṡ, ad^D_μ Ṡ + 𝒴S + 𝒵Ṡ, 𝒵S.
-    let mut carried = [[[Quad::ZERO; 6]; 6]; MAX_GROUPS];
-    let mut carried_rates = [[[Quad::ZERO; 6]; 6]; MAX_GROUPS];
-    let mut forces = [[[Quad::ZERO; 6]; 6]; MAX_GROUPS];
-    let mut drags = [[[Quad::ZERO; 6]; 6]; MAX_GROUPS];
+    let mut carried = [[[Quad::ZERO; 6]; 6]; G];
+    let mut carried_rates = [[[Quad::ZERO; 6]; 6]; G];
+    let mut forces = [[[Quad::ZERO; 6]; 6]; G];
+    let mut drags = [[[Quad::ZERO; 6]; 6]; G];
     for g in 0..groups {
         let momentum: Lane6<S> = load(simd, &del.bodies[g].momentum);
         for l in 0..6 {
@@ -798,9 +1017,11 @@ fn base_pairs<S: Simd>(
             forces[g][l] = store(force);
         }
     }
+    // Without general wrenches the entries behind the diagonal are mirror images.
+    let symmetric = hessian.general.is_empty();
     for k in 0..6 {
-        for l in 0..6 {
-            let mut terms = PairTerms::default();
+        for l in 0..if symmetric { k + 1 } else { 6 } {
+            let mut terms = PairTerms::<G>::ZERO;
             for g in 0..groups {
                 let row = &hessian.columns[k * groups + g];
                 let (row_twist, row_rate): (Lane6<S>, Lane6<S>) =
@@ -833,6 +1054,15 @@ fn base_pairs<S: Simd>(
             }
             let at = (6 * k + l) * block;
             mix(simd, &tables, &terms, s, groups, &mut hessian.base_blocks[at..at + block]);
+            if symmetric && l < k {
+                let image = (6 * l + k) * block;
+                for alpha in 0..=s {
+                    for gamma in 0..=s {
+                        hessian.base_blocks[image + gamma * groups + alpha / LANES].0[alpha % LANES] =
+                            hessian.base_blocks[at + alpha * groups + gamma / LANES].0[gamma % LANES];
+                    }
+                }
+            }
         }
     }
 }

@@ -8,7 +8,7 @@ use alloc::vec::Vec;
 use crate::del_hessian::DelHessian;
 use crate::del_residual::DelWorkspace;
 use crate::errors::FactorError;
-use crate::newton_direction::{BaseEntry, NewtonDirection, jacobian_column_rule};
+use crate::newton_direction::{NewtonDirection, base_block};
 use crate::row_matrix::RowMatrix;
 use crate::tree::KinematicTree;
 
@@ -149,15 +149,25 @@ impl DenseNewton {
             }
         }
         if base > 0 {
-            jacobian_column_rule(tree, del, &self.hessian, |[row, alpha], [column, gamma], entry| {
-                let target = &mut entries[(row * s + alpha) * order + column * s + gamma];
-                match entry {
-                    BaseEntry::Set(value) => *target = value,
-                    BaseEntry::Add(value) => *target += value,
+            for i in tree.first_joint_body()..tree.body_count() {
+                let dof = tree.joint_dof(i);
+                let joint = self.hessian.joint_and_base(i, dof, s, self.hessian.groups);
+                for k in 0..6 {
+                    for alpha in 0..s {
+                        for gamma in 1..=s {
+                            entries[(dof * s + alpha) * order + k * s + gamma - 1] =
+                                joint.joint_row(k, alpha, gamma);
+                            entries[(k * s + alpha) * order + dof * s + gamma - 1] =
+                                joint.base_row(k, alpha, gamma);
+                        }
+                    }
                 }
+            }
+            base_block(del, &self.hessian, s, |[row, alpha], [column, gamma], value| {
+                entries[(row * s + alpha) * order + column * s + gamma] = value;
             });
         }
-        entries
+        &self.lu.entries
     }
 }
 

@@ -157,6 +157,21 @@ pub(crate) fn base_project_rate<S: Simd>(simd: S, base: &BaseLanes, wrench: Lane
     crate::lanes::sub(mat_tr_vec(&load(simd, &base.z_dot), central), mat_tr_vec(&load(simd, &base.z), moved))
 }
 
+/// `Sᵀ X` and the upper half of `Ṡᵀ X` of the base.
+#[inline(always)]
+pub(crate) fn base_project_both<S: Simd>(
+    simd: S,
+    base: &BaseLanes,
+    wrench: Lane6<S>,
+) -> (Lane6<S>, Lane3<S>) {
+    let (torque, force) = halves(wrench);
+    let central = crate::lanes::sub(torque, cross(load(simd, &base.position), force));
+    let moved = cross(load(simd, &base.position_dot), force);
+    let z = load(simd, &base.z);
+    let rate = crate::lanes::sub(mat_tr_vec(&load(simd, &base.z_dot), central), mat_tr_vec(&z, moved));
+    (join(mat_tr_vec(&z, central), mat_tr_vec(&load(simd, &base.center), force)), rate)
+}
+
 /// Fills `base` from chart coordinates and their rates around the chart centre; returns `(R, p, v)` of the base at the nodes.
 #[inline(always)]
 pub(crate) fn base_kinematics<S: Simd>(

@@ -50,6 +50,8 @@ pub(crate) trait Simd: Copy {
     /// `c - a b`.
     fn neg_mul_add(self, a: Self::Lanes, b: Self::Lanes, c: Self::Lanes) -> Self::Lanes;
 
+    /// How many [`Simd::Wide`] a kernel may take at a time and still find registers for its sums.
+    const WIDES: usize;
     /// Sixteen doubles: [`WIDE`] neighbouring quads of a row of right-hand sides.
     type Wide: Copy;
     fn wide_splat(self, x: f64) -> Self::Wide;
@@ -64,6 +66,7 @@ pub(crate) trait Simd: Copy {
 /// The wide operations of an instruction set whose widest register is one [`Simd::Lanes`].
 macro_rules! wide_as_four_lanes {
     () => {
+        const WIDES: usize = 1;
         type Wide = [Self::Lanes; 4];
         #[inline(always)]
         fn wide_splat(self, x: f64) -> Self::Wide {
@@ -221,6 +224,7 @@ impl Simd for pulp::x86::V4 {
         self.negate_mul_add_f64x4(a, b, c)
     }
 
+    const WIDES: usize = 2;
     type Wide = [pulp::f64x8; 2];
     #[inline(always)]
     fn wide_splat(self, x: f64) -> [pulp::f64x8; 2] {
@@ -427,14 +431,6 @@ impl<S: Simd> WideLane<S> {
     #[inline(always)]
     pub fn quads(self) -> [Quad; WIDE] {
         self.simd.wide_store(self.wide)
-    }
-    /// The quads of `row` from `at` on; zero when the row is too short (which the callers rule out).
-    #[inline(always)]
-    pub fn load(simd: S, row: &[Quad], at: usize) -> Self {
-        match row.get(at..).and_then(|rest| rest.first_chunk::<WIDE>()) {
-            Some(quads) => Self { simd, wide: simd.wide_load(quads) },
-            None => Self::splat(simd, 0.0),
-        }
     }
     #[inline(always)]
     pub fn store(self, row: &mut [Quad], at: usize) {

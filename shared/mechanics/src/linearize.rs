@@ -35,7 +35,7 @@ use crate::del_hessian::DelHessian;
 use crate::del_residual::DelWorkspace;
 use crate::errors::{ModelError, StepError};
 use crate::kinetic_hessian::KineticHessian;
-use crate::lanes::{Kernel, Simd, WIDE, WideLane};
+use crate::lanes::{Kernel, Quad, Simd, WIDE, WideLane};
 use crate::lobatto::MAX_UNKNOWN_NODES;
 use crate::mass_matrix_factor::MassMatrixFactor;
 use crate::newton_direction::{NewtonDirection, NewtonSolver};
@@ -49,9 +49,9 @@ use crate::tree::KinematicTree;
 
 /// Mean length of the branches above which the recursion over columns beats the matrix path, for s = 1, 2, 3 and more.
 ///
-/// Measured with `benches/crossover.rs` (Xeon with AVX-512; chains and stars of 8 to 125 links): equal at 15 to 22 for s = 1, 9 to 13 for
-/// s = 2, 16 to 20 for s = 3. Atlas on its foot has 9.8.
-const CROSSOVER_LINEARIZATION: [f64; 3] = [18.0, 12.5, 18.0];
+/// Measured with `benches/crossover.rs` (Xeon with AVX-512; chains and stars of 8 to 125 links): equal at 14 to 18 for s = 2 and 20 to 30
+/// for s = 3; for s = 1 the matrix path takes two thirds of the recursion at 32, the deepest measured. Atlas on its foot has 9.8.
+const CROSSOVER_LINEARIZATION: [f64; 3] = [40.0, 16.0, 26.0];
 
 /// State of the linearised dynamics.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -186,24 +186,44 @@ impl EndBlocks {
         kinetic: Option<&KineticHessian>,
         s: usize,
     ) {
+        // With constant arguments the loops over nodes unroll.
+        match s {
+            1 => self.fill_entries(tree, hessian, 1),
+            2 => self.fill_entries(tree, hessian, 2),
+            3 => self.fill_entries(tree, hessian, 3),
+            s => self.fill_entries(tree, hessian, s),
+        }
+        let Some(kinetic) = kinetic else { return };
         for i in 0..self.starts.len() - 1 {
             let first = hessian.pair_starts[i];
             for position in 0..tree.branch(i).len() {
                 let [own, other] = self.places[first + position].map(|place| place as usize * s);
-                let pair = first + position;
-                for gamma in 1..=s {
-                    self.entries[other + gamma - 1] = hessian.mirrored(pair, s, gamma);
-                    self.entries[own + gamma - 1] = hessian.entry(pair, s, gamma);
+                let terms = kinetic.pair(i, position);
+                if own != other {
+                    self.entries[other + s - 1] -= terms[2].0[1];
                 }
-                if let Some(kinetic) = kinetic {
-                    let terms = kinetic.pair(i, position);
-                    if own != other {
-                        self.entries[other + s - 1] -= terms[2].0[1];
-                    }
-                    self.entries[own + s - 1] -= terms[1].0[1];
+                self.entries[own + s - 1] -= terms[1].0[1];
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn fill_entries(&mut self, tree: &KinematicTree, hessian: &DelHessian, s: usize) {
+        for i in 0..self.starts.len() - 1 {
+            let pairs = hessian.pair_starts[i]..hessian.pair_starts[i + 1];
+            for (block, &places) in hessian.body_pairs(i, s).zip(&self.places[pairs]) {
+                let [own, other] = places.map(|place| place as usize * s);
+                let entries = &mut self.entries[other..other + s];
+                for gamma in 1..=s {
+                    entries[gamma - 1] = block.mirrored(s, gamma);
+                }
+                let entries = &mut self.entries[own..own + s];
+                for gamma in 1..=s {
+                    entries[gamma - 1] = block.entry(s, gamma);
                 }
             }
         }
+        debug_assert_eq!(tree.dof() + 1, self.starts.len());
     }
 }
 
@@ -353,11 +373,11 @@ impl Linearizer {
         let (n, s) = (tree.dof(), self.s);
         let out = &mut self.step.matrix;
         for i in 0..n {
-            for (position, &j) in tree.branch(i).iter().enumerate() {
-                let (j, pair) = (j as usize, hessian.pair_starts[i] + position);
-                out.add(n + i, j, hessian.entry(pair, s, 0));
+            for (block, &j) in hessian.body_pairs(i, s).zip(tree.branch(i)) {
+                let j = j as usize;
+                out.add(n + i, j, block.entry(s, 0));
                 if i != j {
-                    out.add(n + j, i, hessian.mirrored(pair, s, 0));
+                    out.add(n + j, i, block.mirrored(s, 0));
                 }
             }
             let last = match self.hold {
@@ -595,16 +615,17 @@ fn fill_right_hand_sides(
 ) {
     let (n, s) = (tree.dof(), del.unknown_nodes());
     z.clear();
+    // With constant arguments the loops over nodes unroll.
+    match s {
+        1 => fill_start_columns(tree, hessian, z, 1),
+        2 => fill_start_columns(tree, hessian, z, 2),
+        3 => fill_start_columns(tree, hessian, z, 3),
+        s => fill_start_columns(tree, hessian, z, s),
+    }
     for i in 0..n {
-        for (position, &j) in tree.branch(i).iter().enumerate() {
-            let (j, pair) = (j as usize, hessian.pair_starts[i] + position);
-            for alpha in 0..s {
-                z.set(i * s + alpha, j, -hessian.entry(pair, alpha, 0));
-                if i != j {
-                    z.set(j * s + alpha, i, -hessian.mirrored(pair, alpha, 0));
-                }
-            }
-            if let Some(kinetic) = kinetic {
+        if let Some(kinetic) = kinetic {
+            for (position, &j) in tree.branch(i).iter().enumerate() {
+                let j = j as usize;
                 let [mass, own_rate, other_rate, _] = kinetic.pair(i, position).map(|q| q.0[0]);
                 z.add(i * s, j, -own_rate);
                 z.set(i * s, n + j, -mass);
@@ -613,8 +634,7 @@ fn fill_right_hand_sides(
                     z.set(j * s, n + i, -mass);
                 }
             }
-        }
-        if kinetic.is_none() {
+        } else {
             z.set(i * s, n + i, -1.0);
         }
         for alpha in 0..s {
@@ -623,6 +643,20 @@ fn fill_right_hand_sides(
                 InputHold::PerNode => 2 * n + alpha * n + i,
             };
             z.set(i * s + alpha, column, -del.rule.weights()[alpha] * del.time_step);
+        }
+    }
+}
+
+/// `-H[α,0]`.
+#[inline(always)]
+fn fill_start_columns(tree: &KinematicTree, hessian: &DelHessian, z: &mut RowMatrix, s: usize) {
+    for i in 0..tree.dof() {
+        for (block, &j) in hessian.body_pairs(i, s).zip(tree.branch(i)) {
+            let j = j as usize;
+            for alpha in 0..s {
+                z.set(j * s + alpha, i, -block.mirrored(alpha, 0));
+                z.set(i * s + alpha, j, -block.entry(alpha, 0));
+            }
         }
     }
 }
@@ -649,38 +683,72 @@ impl Kernel for EndRows<'_> {
 
 #[inline(always)]
 fn end_rows<S: Simd, const N: usize>(simd: S, work: &mut EndRows<'_>, s: usize) {
-    let stride = work.z.stride();
-    let z = work.z.quads();
-    let out = work.out.quads_mut();
+    let stride = work.z.stride() / WIDE;
+    let mut at = 0;
+    while S::WIDES == 2 && at + 2 <= stride {
+        end_rows_at::<S, N, 2>(simd, work, at, s);
+        at += 2;
+    }
+    for at in at..stride {
+        end_rows_at::<S, N, 1>(simd, work, at, s);
+    }
+}
+
+/// `W` pieces of the columns from `at` on.
+#[inline(always)]
+fn end_rows_at<S: Simd, const N: usize, const W: usize>(
+    simd: S,
+    work: &mut EndRows<'_>,
+    at: usize,
+    s: usize,
+) {
+    let stride = work.z.stride() / WIDE;
+    let z = work.z.pieces();
+    let out = work.out.pieces_mut();
     let blocks = work.blocks;
     let n = blocks.starts.len() - 1;
     let (zero, one) = (WideLane::splat(simd, 0.0), WideLane::splat(simd, 1.0));
-    for at in (0..stride).step_by(WIDE) {
-        for i in 0..n {
-            WideLane::load(simd, z, (i * s + s - 1) * stride + at).store(out, i * stride + at);
-            let range = blocks.starts[i]..blocks.starts[i + 1];
-            let entries = &blocks.entries[range.start * s..range.end * s];
-            // Sums of their own for every γ and for every second coordinate hide the latency of the multiply-add.
-            let (mut even, mut odd) = ([zero; N], [zero; N]);
-            for (pair, entries) in blocks.related[range].chunks(2).zip(entries.chunks(2 * s)) {
-                let first = pair[0] as usize * s * stride + at;
-                for k in 0..s {
-                    let from = WideLane::load(simd, z, first + k * stride);
-                    even[k] = WideLane::splat(simd, entries[k]).mul_add(from, even[k]);
-                }
-                if let [_, second] = pair {
-                    let second = *second as usize * s * stride + at;
-                    for k in 0..s {
-                        let from = WideLane::load(simd, z, second + k * stride);
-                        odd[k] = WideLane::splat(simd, entries[s + k]).mul_add(from, odd[k]);
-                    }
-                }
-            }
+    for i in 0..n {
+        let last = (i * s + s - 1) * stride + at;
+        out[i * stride + at..][..W].copy_from_slice(&z[last..last + W]);
+        let range = blocks.starts[i]..blocks.starts[i + 1];
+        let entries = &blocks.entries[range.start * s..range.end * s];
+        // Sums of their own for every γ and for every second coordinate hide the latency of the multiply-add.
+        let (mut even, mut odd) = ([[zero; W]; N], [[zero; W]; N]);
+        let (pairs, last) = blocks.related[range].as_chunks::<2>();
+        let (of_pairs, of_last) = entries.split_at(2 * s * pairs.len());
+        for (&[first, second], entries) in pairs.iter().zip(of_pairs.chunks_exact(2 * s)) {
+            add_products(simd, z, &mut even, first as usize * s * stride + at, stride, &entries[..s]);
+            add_products(simd, z, &mut odd, second as usize * s * stride + at, stride, &entries[s..]);
+        }
+        for &last in last {
+            add_products(simd, z, &mut even, last as usize * s * stride + at, stride, of_last);
+        }
+        for w in 0..W {
             let mut sum = zero;
             for k in 0..s {
-                sum = one.mul_add(even[k], one.mul_add(odd[k], sum));
+                sum = one.mul_add(even[k][w], one.mul_add(odd[k][w], sum));
             }
-            sum.store(out, (n + i) * stride + at);
+            out[(n + i) * stride + at + w] = sum.quads();
+        }
+    }
+}
+
+/// `sums_k += entries_k z_k` for the rows from `first` on.
+#[inline(always)]
+fn add_products<S: Simd, const N: usize, const W: usize>(
+    simd: S,
+    z: &[[Quad; WIDE]],
+    sums: &mut [[WideLane<S>; W]; N],
+    first: usize,
+    stride: usize,
+    entries: &[f64],
+) {
+    for (k, &entry) in entries.iter().enumerate() {
+        let row = &z[first + k * stride..][..W];
+        let entry = WideLane::splat(simd, entry);
+        for w in 0..W {
+            sums[k][w] = entry.mul_add(WideLane::of(simd, &row[w]), sums[k][w]);
         }
     }
 }
@@ -696,27 +764,27 @@ impl Kernel for SolveMass<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { factor, out } = self;
-        let stride = out.stride();
+        let stride = out.stride() / WIDE;
         let n = factor.pivots().len();
-        let out = out.quads_mut();
-        for at in (0..stride).step_by(WIDE) {
+        let out = out.pieces_mut();
+        for at in 0..stride {
             let row = |k: usize| (n + k) * stride + at;
             for k in (0..n).rev() {
-                let own = WideLane::load(simd, out, row(k));
+                let own = WideLane::of(simd, &out[row(k)]);
                 for &j in factor.ancestors(k) {
                     let l = WideLane::splat(simd, factor.lower(k, j as usize));
-                    let target = row(j as usize);
-                    l.neg_mul_add(own, WideLane::load(simd, out, target)).store(out, target);
+                    let target = &mut out[row(j as usize)];
+                    *target = l.neg_mul_add(own, WideLane::of(simd, target)).quads();
                 }
             }
             for k in 0..n {
                 let scale = WideLane::splat(simd, 1.0 / factor.pivots()[k]);
-                let mut own = scale.mul_add(WideLane::load(simd, out, row(k)), WideLane::splat(simd, 0.0));
+                let mut own = scale.mul_add(WideLane::of(simd, &out[row(k)]), WideLane::splat(simd, 0.0));
                 for &j in factor.ancestors(k) {
                     let l = WideLane::splat(simd, factor.lower(k, j as usize));
-                    own = l.neg_mul_add(WideLane::load(simd, out, row(j as usize)), own);
+                    own = l.neg_mul_add(WideLane::of(simd, &out[row(j as usize)]), own);
                 }
-                own.store(out, row(k));
+                out[row(k)] = own.quads();
             }
         }
     }

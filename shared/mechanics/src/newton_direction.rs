@@ -54,9 +54,9 @@ pub enum NewtonMethod {
 
 /// Root-mean-square depth above which Algorithm B.1 beats the branch LU, for s = 1, 2, 3, 4 and more.
 ///
-/// Measured with `benches/crossover.rs` (Xeon with AVX-512; chains and stars of 8 to 125 links): factor and solve cost the same at depth 6
-/// to 7 for s = 1, 14 to 15 for s = 2, 19 to 28 for s = 3, 12 to 15 for s = 4. Atlas on its foot has 10.6.
-const CROSSOVER_DEPTH: [f64; 4] = [6.5, 14.5, 23.0, 14.0];
+/// Measured with `benches/crossover.rs` (Xeon with AVX-512; chains and stars of 8 to 125 links): factor and solve cost the same at depth 5
+/// to 7 for s = 1, 17 to 19 for s = 2, 36 for s = 3 (chains), 12 to 14 for s = 4. Atlas on its foot has 10.6.
+const CROSSOVER_DEPTH: [f64; 4] = [6.0, 18.0, 36.0, 13.0];
 
 impl NewtonMethod {
     /// The faster one for a tree and a number of unknown nodes, by measured crossover of the depth.
@@ -119,44 +119,18 @@ impl NewtonDirection for NewtonSolver {
     }
 }
 
-/// An entry of the Newton matrix in the rows or columns of the base.
-pub(crate) enum BaseEntry {
-    Set(f64),
-    Add(f64),
-}
-
-/// Everything in the Newton matrix of a floating tree that is not plainly `H[α,γ]` (module doc of [`crate::del_hessian`]).
-///
-/// Calls `put([coordinate, α], [coordinate, γ - 1], entry)`, row first: `Set` for all base-base entries and the joint columns of
-/// the base rows `α = 0`; `Add` for what comes on top of `H` in the base columns of the joint rows.
-pub(crate) fn jacobian_column_rule(
-    tree: &KinematicTree,
+/// The base-base entries of the Newton matrix of a floating tree (module doc of [`crate::del_hessian`]): calls
+/// `set([coordinate, α], [coordinate, γ - 1], value)`, row first. `s` is the number of unknown nodes (a constant where the caller wants
+/// the loops unrolled).
+#[inline(always)]
+pub(crate) fn base_block(
     del: &DelWorkspace,
     hessian: &DelHessian,
-    mut put: impl FnMut([usize; 2], [usize; 2], BaseEntry),
+    s: usize,
+    mut set: impl FnMut([usize; 2], [usize; 2], f64),
 ) {
-    let s = del.unknown_nodes();
     let start_twists = base_matrix(del, 0);
     let end_twists = base_matrix(del, s);
-    let last = s - 1;
-
-    for i in 1..tree.body_count() {
-        let dof = tree.joint_dof(i);
-        let first_pair = hessian.pair_starts[i];
-        for alpha in 0..s {
-            for k in 0..6 {
-                let change = hessian.shift_on_base(dof, k, alpha) - hessian.entry(first_pair + k, alpha, 0);
-                put([dof, alpha], [k, last], BaseEntry::Add(change));
-            }
-        }
-        for gamma in 1..=s {
-            for k in 0..6 {
-                let ahead =
-                    hessian.mirrored(first_pair + k, 0, gamma) - hessian.mirrored(first_pair + k, s, gamma);
-                put([k, 0], [dof, gamma - 1], BaseEntry::Set(ahead + hessian.impulse_on_base(dof, k, gamma)));
-            }
-        }
-    }
 
     // Change of the total impulse by δξ^s through the rigid shift S^0 δξ^s and through δξ^0 = -δξ^s.
     let mut shifted_impulse = Matrix6::from_fn(|r, k| -hessian.impulse_column(k, 0)[r]);
@@ -174,23 +148,31 @@ pub(crate) fn jacobian_column_rule(
         second_order_matrix(del, s, &momentum_end) - second_order_matrix(del, 0, &del.start_momentum());
     let last_column = end_twists.tr_mul(&(shifted_impulse + turned)) + curved;
     for k in 0..6 {
-        for l in 0..6 {
-            for gamma in 1..=s {
-                for alpha in 1..s {
+        for alpha in 1..s {
+            let shifts = hessian.shift_on_base(k, alpha);
+            for l in 0..6 {
+                for gamma in 1..=s {
                     let mut value = hessian.base_entry(k, l, alpha, gamma);
                     if gamma == s {
-                        value += hessian.shift_on_base(k, l, alpha) - hessian.base_entry(k, l, alpha, 0);
+                        value += shifts[l] - hessian.base_entry(k, l, alpha, 0);
                     }
-                    put([k, alpha], [l, gamma - 1], BaseEntry::Set(value));
+                    set([k, alpha], [l, gamma - 1], value);
                 }
-                let mut value = hessian.base_entry(k, l, 0, gamma) - hessian.base_entry(k, l, s, gamma)
-                    + hessian.impulse_on_base(l, k, gamma);
+            }
+        }
+    }
+    for l in 0..6 {
+        for gamma in 1..=s {
+            let impulses = hessian.impulse_on_base(l, gamma);
+            for k in 0..6 {
+                let mut value =
+                    hessian.base_entry(k, l, 0, gamma) - hessian.base_entry(k, l, s, gamma) + impulses[k];
                 if gamma == s {
-                    value += last_column[(k, l)] + hessian.shift_on_base(k, l, 0)
-                        - hessian.shift_on_base(k, l, s)
+                    value += last_column[(k, l)] + hessian.shift_on_base(k, 0)[l]
+                        - hessian.shift_on_base(k, s)[l]
                         - (hessian.base_entry(k, l, 0, 0) - hessian.base_entry(k, l, s, 0));
                 }
-                put([k, 0], [l, gamma - 1], BaseEntry::Set(value));
+                set([k, 0], [l, gamma - 1], value);
             }
         }
     }

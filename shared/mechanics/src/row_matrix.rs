@@ -67,6 +67,18 @@ impl RowMatrix {
         self.stride
     }
 
+    /// All rows in pieces of sixteen columns, `stride() / WIDE` per row.
+    #[inline(always)]
+    pub(crate) fn pieces(&self) -> &[[Quad; WIDE]] {
+        self.quads().as_chunks().0
+    }
+
+    /// As [`RowMatrix::pieces`].
+    #[inline(always)]
+    pub(crate) fn pieces_mut(&mut self) -> &mut [[Quad; WIDE]] {
+        self.quads_mut().as_chunks_mut().0
+    }
+
     #[inline(always)]
     pub(crate) fn quads(&self) -> &[Quad] {
         &self.data[self.first..]

@@ -9,21 +9,23 @@
 //!
 //! **Start.** The interpolation polynomial of the step before is extrapolated, `q^α := Σ_β l_β(1 + c_α) q_prev^β`, when the step
 //! continues where the last one ended (a floating base: in the chart of the last step, then moved to the new one). What the last
-//! extrapolation missed is added: it changes little from step to step, so that the guess gains an order. Else
+//! extrapolation missed is added: it changes little from step to step, so that the guess gains an order; and where it has changed
+//! steadily, its trend, for another order. Else
 //! `q^α = q^0 + c_α Δt M⁻¹p`; if Newton fails from there, `q^α = q^0`.
 //!
 //! **Iteration.** `J` is factorised once and kept while the iteration contracts (simplified Newton), also over the steps that
 //! continue the motion and after a linearisation: it changes by `O(Δt)` from step to step, and a factorisation costs as much as
-//! two or three iterations. When old factors take more iterations than new ones are worth (light links at high accelerations), the next
-//! sixteen steps make new ones. Broyden's update on top of the factors costs a few scalar products and saves about one iteration. `J`
+//! two or three iterations. When old factors take more iterations than new ones are worth, the next step makes new ones; when
+//! they do not contract (light links at high accelerations), the next sixteen do. Broyden's update on top of the factors costs a few scalar products and saves about one iteration. `J`
 //! is renewed when `θ` exceeds 0.1. A change may be limited to [`StepOptions::change_limit`] in the largest angle, a trust region
 //! without a merit function: on a 32-link chain at steps of 40 ms (trapezoidal, random states, `tests/paper`) it raises the share of
 //! solved steps from 0.5 to 0.9.
 //!
 //! **Stop.** On the change, never on the residual: its floor `~10 ε max|a^{αβ} Sᵀμ|` grows with the length of the chain. Done
 //! when the next change is predicted below [`StepOptions::accuracy`] times `1 + max|q|`, by default 1e-16: what is left of it accumulates in the momenta over many steps
-//! (stopping at 1e-14 left 1e-10 in an exactly conserved momentum after 500 steps). Or when the change is below `1e-8` and no
-//! longer shrinks: round-off.
+//! (stopping at 1e-14 left 1e-10 in an exactly conserved momentum after 500 steps). With old factors the prediction is linear in the
+//! change, and when round-off hides a contraction, those before it count; with the factors of the guess the second change is as the square of the first, and their ratio in an earlier step, times ten
+//! for safety, may end the iteration at the first. Or when the change is below `1e-8` and no longer shrinks: round-off.
 //!
 //! Source: the paper, section 3.2 (there `δq = -J r`; the inverse is missing in print); Broyden's method in the form of
 //! C. T. Kelley, *Iterative Methods for Linear and Nonlinear Equations*, SIAM 1995, section 7.3.
@@ -53,8 +55,11 @@ const STAGNATION_CHANGE: f64 = 1e-8;
 const RENEW_CONTRACTION: f64 = 0.1;
 /// Iterations that cost as much as a factorisation: the factors of an earlier step may take this many more than new ones.
 const FACTOR_ITERATIONS: usize = 2;
-/// When they take more, this many steps begin with new factors before old ones are tried again.
+/// When they do not contract, this many steps begin with new factors before old ones are tried again; when they only take more
+/// iterations, one.
 const REUSE_PAUSE: u32 = 16;
+/// The ratio of the last step may have grown by this much when it predicts the second change of this one.
+const SAFETY: f64 = 10.0;
 /// Broyden's update remembers this many changes.
 const BROYDEN_MEMORY: usize = 8;
 
@@ -162,13 +167,19 @@ pub struct Integrator {
     /// Nodes as extrapolated, and what the last extrapolation missed: `dof * s + α - 1`.
     extrapolated: Vec<f64>,
     missed: Vec<f64>,
-    has_missed: bool,
+    /// What the extrapolation before that missed.
+    missed_before: Vec<f64>,
+    /// How many of the two are known, and whether their trend told the last one better than the one before it.
+    known_missed: usize,
+    follows_trend: bool,
     /// The solver holds the factors of a Newton matrix of this motion.
     factored: bool,
     /// Iterations of the last step with new factors and a full guess; zero before the first one.
     new_factor_iterations: usize,
     /// Steps until old factors are tried again.
     reuse_pause: u32,
+    /// Second change over the square of the first, with the factors of the guess, the last time that there were two.
+    quadratic: f64,
     /// `x^1..x^s` of a floating base where it was made.
     factored_travel: Vec<Vector3<f64>>,
     /// Where the guess put node s.
@@ -217,10 +228,13 @@ impl Integrator {
             has_previous: false,
             extrapolated: vec![0.0; order],
             missed: vec![0.0; order],
-            has_missed: false,
+            missed_before: vec![0.0; order],
+            known_missed: 0,
+            follows_trend: false,
             factored: false,
             new_factor_iterations: 0,
             reuse_pause: 0,
+            quadratic: f64::INFINITY,
             factored_travel: vec![Vector3::zeros(); if tree.is_floating() { s } else { 0 }],
             guessed_end: vec![0.0; tree.dof()],
             changes: vec![0.0; BROYDEN_MEMORY * order],
@@ -271,7 +285,7 @@ impl Integrator {
                 return self.keep(tree, report);
             }
         }
-        self.has_missed = false;
+        self.known_missed = 0;
         self.factored = false;
         self.guess_by_velocity(tree, state)?;
         let mut outcome = self.newton(tree, forces, &mut report).and_then(|()| self.accept(tree));
@@ -289,6 +303,7 @@ impl Integrator {
     pub fn forget(&mut self) {
         self.has_previous = false;
         self.factored = false;
+        self.quadratic = f64::INFINITY;
     }
 
     /// Changes the time step (s).
@@ -356,22 +371,32 @@ impl Integrator {
             for alpha in 1..=s {
                 let at = dof * s + alpha - 1;
                 self.extrapolated[at] = self.del.node(alpha, dof);
-                if self.has_missed {
-                    self.del.move_node(alpha, dof, self.missed[at]);
+                if self.known_missed > 0 {
+                    let trend =
+                        if self.follows_trend { self.missed[at] - self.missed_before[at] } else { 0.0 };
+                    self.del.move_node(alpha, dof, self.missed[at] + trend);
                 }
             }
         }
     }
 
+    /// Keeps what the extrapolation missed, and finds out whether to follow its trend: the order it gains is lost where inputs jump.
     fn remember_missed(&mut self, tree: &KinematicTree) {
         let s = self.del.unknown_nodes();
+        let (mut without, mut with) = (0.0f64, 0.0f64);
         for dof in 0..tree.dof() {
             for alpha in 1..=s {
                 let at = dof * s + alpha - 1;
-                self.missed[at] = self.del.node(alpha, dof) - self.extrapolated[at];
+                let missed = self.del.node(alpha, dof) - self.extrapolated[at];
+                let change = missed - self.missed[at];
+                without = without.max(change.abs());
+                with = with.max((change - (self.missed[at] - self.missed_before[at])).abs());
+                self.missed_before[at] = self.missed[at];
+                self.missed[at] = missed;
             }
         }
-        self.has_missed = true;
+        self.follows_trend = self.known_missed == 2 && with < without;
+        self.known_missed = (self.known_missed + 1).min(2);
     }
 
     /// The guess of a floating base is in the chart of the last step: the same poses in the chart of this step.
@@ -505,6 +530,7 @@ impl Integrator {
         let mut remembered = 0;
         let mut contracts = self.factored;
         let (old_factors, mut renewed) = (self.factored, false);
+        let factorizations = report.factorizations;
         let mut residual = f64::INFINITY;
         for iteration in 0..self.options.max_iterations {
             self.del.evaluate(tree, forces.laws);
@@ -551,18 +577,31 @@ impl Integrator {
             // Old factors contract unevenly: the worse of two contractions counts, and a poor one is no sign of round-off.
             let old = old_factors && !renewed;
             let rate = if old { contraction.max(last_contraction) } else { contraction };
+            // What is left by the contractions before this one, should round-off hide how much this change is smaller than the last.
+            let left = last_change * last_contraction * last_contraction;
+            let hidden = old && iteration > 1 && change < STAGNATION_CHANGE * size;
             let small = if old { self.options.accuracy } else { SMALL_CHANGE.max(self.options.accuracy) };
+            // Newton's method with the matrix of the guess: the second change is as the square of the first.
+            let fresh = renewed && !limited && report.factorizations == factorizations + 1;
+            if fresh && iteration == 1 {
+                self.quadratic = change / (last_change * last_change);
+            }
+            let predicted = SAFETY * self.quadratic * change * change;
             if change <= small * size
+                || (fresh && iteration == 0 && predicted <= self.options.accuracy * size)
                 || (iteration > 0 && change * rate <= self.options.accuracy * size)
+                || (hidden && left <= self.options.accuracy * size)
                 || (!old && change < STAGNATION_CHANGE * size && contraction > 0.5)
             {
                 self.del.evaluate(tree, forces.laws);
                 if !old_factors {
-                    if self.has_missed {
+                    if self.known_missed > 0 {
                         self.new_factor_iterations = iteration + 1;
                     }
-                } else if renewed || iteration + 1 > self.new_factor_iterations + FACTOR_ITERATIONS {
+                } else if renewed {
                     self.reuse_pause = REUSE_PAUSE;
+                } else if iteration + 1 > self.new_factor_iterations + FACTOR_ITERATIONS {
+                    self.reuse_pause = 1;
                 }
                 return Ok(());
             }
