@@ -355,7 +355,8 @@ impl Controller {
         let measured_s = self.run_time_s(state.time_ns);
         self.reference.com_shift = Vector3::zeros();
         self.reference.sample(measured_s, &mut self.targets);
-        self.trim.update(&self.targets.com, &Vector3::from(state.stance_torque_b), &measured, since_last_s);
+        let (torque, rates) = (Vector3::from(state.stance_torque_b), &self.estimator.estimate().q_dot);
+        self.trim.update(&self.targets.com, &torque, &measured, rates, since_last_s);
         self.reference.com_shift = self.trim.shift();
         self.test_innovation(measured_s);
         let Estimate { q, q_dot, .. } = self.estimator.estimate();
