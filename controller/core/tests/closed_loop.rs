@@ -217,7 +217,7 @@ fn a_controller_can_be_told_to_stand_otherwise() {
     let state = WeldedPlant::new(&atlas).measure();
     let mut bent = atlas.controller_model();
     bent.posture.iter_mut().for_each(|q| *q *= 0.9);
-    let mut law = |controller: &mut Controller, k: u64| {
+    let law = |controller: &mut Controller, k: u64| {
         let mut state = state;
         state.time_ns = 5_000_000 * k;
         let command = controller.cycle(&state, state.time_ns, &StoppedClock);
