@@ -25,8 +25,12 @@ def read_fields(lines, types, data, offset):
             kind, count = kind[:-1].split("[")
             count = int(count)
         if kind in types:
-            offset += -offset % 8
-            fields[name], offset = read_fields(types[kind], types, data, offset)
+            parts = []
+            for _ in range(count):
+                offset += -offset % 8
+                part, offset = read_fields(types[kind], types, data, offset)
+                parts.append(part)
+            fields[name] = parts[0] if count == 1 else parts
             continue
         letter, width = WIDTH[kind]
         offset += -offset % width
@@ -84,6 +88,8 @@ def main(folder):
             elif channel.topic == "/controller/command" and seen[channel.topic] == 1:
                 command = decode(schema, message.data)
                 assert command["header"]["magic"] and command["n_joints"] == 30
+                begins = [segment["begin_ns"] for segment in command["segments"][: command["n_segments"]]]
+                assert begins[0] == 0 and begins == sorted(set(begins)), begins
         (about,) = (record.metadata for record in reader.iter_metadata() if record.name == "run")
         files = {attachment.name: attachment.data for attachment in reader.iter_attachments()}
 
