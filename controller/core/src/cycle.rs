@@ -110,9 +110,10 @@ pub struct Controller {
     has_plan: bool,
     /// Whether `nominal`, `horizon` and `riccati` are those of a solution to come, and what that took.
     prepared: Option<Preparation>,
-    /// When the last cycle began, by the caller's clock, and how long the last preparation took, ns.
+    /// When the last cycle began, by the caller's clock, ns.
     cycle_began_ns: u64,
-    preparation_ns: u64,
+    /// How long the last preparations took, the latest one first, ns.
+    preparations_ns: [u64; 3],
     /// Time of the first node the present factors belong to, s of the run.
     factors_start_s: f64,
 
@@ -200,7 +201,7 @@ impl Controller {
             has_plan: false,
             prepared: None,
             cycle_began_ns: 0,
-            preparation_ns: 0,
+            preparations_ns: [0; 3],
             factors_start_s: 0.0,
             predicted: vec![0.0; 2 * n],
             predicted_for_s: 0.0,
@@ -305,12 +306,15 @@ impl Controller {
         }
         let Some(last_ns) = self.last_state_ns else { return };
         let begin_ns = clock.now_ns();
-        let ready_s = (begin_ns.saturating_sub(self.cycle_began_ns) + self.preparation_ns) as f64 * 1e-9;
+        // One that was held up says nothing about the next one.
+        let usual_ns = self.preparations_ns.iter().copied().fold(u64::MAX, u64::min);
+        let ready_s = (begin_ns.saturating_sub(self.cycle_began_ns) + usual_ns) as f64 * 1e-9;
         let periods = libm::ceil(ready_s / self.config.period_s).max(1.0);
         let next_ns = last_ns + to_ns(periods * self.config.period_s);
         let start_s = self.run_time_s(next_ns) + self.config.delay_s;
         self.prepared = self.prepare_for(start_s, &mut StopWatch::start(clock)).ok();
-        self.preparation_ns = clock.now_ns().saturating_sub(begin_ns);
+        self.preparations_ns.rotate_right(1);
+        self.preparations_ns[0] = clock.now_ns().saturating_sub(begin_ns);
     }
 
     /// Nominal, linearisation, factors and warm rows of the problem that begins at `start_s`.
