@@ -60,7 +60,7 @@ pub struct TransportReport {
     pub state_one_way: Quantity,
     /// Round trip of a state answered by a command.
     pub command_round_trip: Quantity,
-    /// One way of a command, 18 104 bytes.
+    /// One way of a command, 28 928 bytes.
     pub command_one_way: Quantity,
     /// Median round trip of a state over that of the flag.
     pub ratio_to_flag: Option<f64>,
