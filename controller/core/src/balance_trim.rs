@@ -28,7 +28,7 @@ use nalgebra::{Vector2, Vector3};
 const LARGEST_ERROR_M: f64 = 0.02;
 /// `t_max`, m.
 const LARGEST_TRIM_M: f64 = 0.06;
-/// Joint rates (root mean square, rad/s or m/s) up to which the robot stands; the noise of good encoders is a tenth of it.
+/// Joint rates (root mean square, rad/s or m/s) up to which the robot stands; the noise of good encoders is far below.
 const STANDING_RATE: f64 = 0.05;
 /// A foot that carries less than this, in N, has no pressure point to speak of.
 const LEAST_FORCE_N: f64 = 50.0;
