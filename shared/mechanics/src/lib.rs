@@ -56,6 +56,7 @@
 extern crate alloc;
 
 pub mod branch_lu;
+pub mod broyden;
 pub mod constraints;
 pub mod del_hessian;
 pub mod del_residual;

@@ -34,6 +34,7 @@ use alloc::vec;
 use alloc::vec::Vec;
 use nalgebra::Vector3;
 
+use crate::broyden::Broyden;
 use crate::del_residual::{DelWorkspace, ForceCapacity};
 use crate::dense_lu::DenseNewton;
 use crate::errors::{FactorError, ModelError, StepError};
@@ -60,8 +61,6 @@ const FACTOR_ITERATIONS: usize = 2;
 const REUSE_PAUSE: u32 = 16;
 /// The ratio of the last step may have grown by this much when it predicts the second change of this one.
 const SAFETY: f64 = 10.0;
-/// Broyden's update remembers this many changes.
-const BROYDEN_MEMORY: usize = 8;
 
 /// How the Newton matrix is used from one iteration to the next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -184,9 +183,7 @@ pub struct Integrator {
     factored_travel: Vec<Vector3<f64>>,
     /// Where the guess put node s.
     guessed_end: Vec<f64>,
-    changes: Vec<f64>,
-    /// Their squares.
-    squares: [f64; BROYDEN_MEMORY],
+    broyden: Broyden,
 }
 
 impl Integrator {
@@ -237,8 +234,7 @@ impl Integrator {
             quadratic: f64::INFINITY,
             factored_travel: vec![Vector3::zeros(); if tree.is_floating() { s } else { 0 }],
             guessed_end: vec![0.0; tree.dof()],
-            changes: vec![0.0; BROYDEN_MEMORY * order],
-            squares: [0.0; BROYDEN_MEMORY],
+            broyden: Broyden::new(order),
             del,
         })
     }
@@ -522,12 +518,11 @@ impl Integrator {
         report: &mut StepReport,
     ) -> Result<(), StepError> {
         let s = self.del.unknown_nodes();
-        let order = s * tree.dof();
         for (dof, end) in self.guessed_end.iter_mut().enumerate() {
             *end = self.del.node(s, dof);
         }
         let (mut last_change, mut last_contraction) = (f64::INFINITY, 0.0f64);
-        let mut remembered = 0;
+        self.broyden.forget();
         let mut contracts = self.factored;
         let (old_factors, mut renewed) = (self.factored, false);
         let factorizations = report.factorizations;
@@ -541,7 +536,7 @@ impl Integrator {
             }
             if self.options.variant == NewtonVariant::Exact || !contracts {
                 self.factor(tree, report)?;
-                remembered = 0;
+                self.broyden.forget();
                 renewed = true;
             }
             match (&mut self.dense, self.use_dense) {
@@ -552,7 +547,7 @@ impl Integrator {
                 *x = -*x;
             }
             if self.options.variant == NewtonVariant::Broyden {
-                self.broyden(order, &mut remembered);
+                self.broyden.improve(&mut self.direction);
             }
             if tree.is_floating() {
                 self.turn_travel_with_chart();
@@ -636,33 +631,6 @@ impl Integrator {
         limited
     }
 
-    /// Broyden's method on top of the factors: turns `-J_0⁻¹ r` into the quasi-Newton change, and remembers it.
-    fn broyden(&mut self, order: usize, remembered: &mut usize) {
-        for j in 0..*remembered {
-            let own = &self.changes[j * order..(j + 1) * order];
-            let factor = inner_product(own, &self.direction) / self.squares[j];
-            if j + 1 < *remembered {
-                let next = &self.changes[(j + 1) * order..(j + 2) * order];
-                for (x, n) in self.direction.iter_mut().zip(next) {
-                    *x += factor * n;
-                }
-            } else {
-                // A change that turns back on the last one: no update (the plain simplified step is kept).
-                let scale = 1.0 - factor;
-                if scale.abs() > 0.1 {
-                    for x in &mut self.direction {
-                        *x /= scale;
-                    }
-                }
-            }
-        }
-        if *remembered < BROYDEN_MEMORY {
-            self.changes[*remembered * order..(*remembered + 1) * order].copy_from_slice(&self.direction);
-            self.squares[*remembered] = inner_product(&self.direction, &self.direction);
-            *remembered += 1;
-        }
-    }
-
     /// Refuses solutions that are not the continuation of the motion.
     fn accept(&self, tree: &KinematicTree) -> Result<(), StepError> {
         let s = self.del.unknown_nodes();
@@ -700,19 +668,6 @@ impl Integrator {
         self.has_previous = true;
         Ok(report)
     }
-}
-
-/// Scalar product in four partial sums: additions need not wait for each other.
-fn inner_product(a: &[f64], b: &[f64]) -> f64 {
-    let mut sums = [0.0f64; 4];
-    let (whole, other) = (a.chunks_exact(4), b.chunks_exact(4));
-    let rest: f64 = whole.remainder().iter().zip(other.remainder()).map(|(x, y)| x * y).sum();
-    for (x, y) in whole.zip(other) {
-        for k in 0..4 {
-            sums[k] += x[k] * y[k];
-        }
-    }
-    rest + (sums[0] + sums[1]) + (sums[2] + sums[3])
 }
 
 #[cfg(test)]

@@ -14,11 +14,11 @@
 //! 0.53, 0.25; plain from a Runge-Kutta step 0.87, 0.45, 0.21.
 //!
 //! `J` is factorised in the first iteration, and again when the change was limited or did not become ten times smaller; in between
-//! [`crate::broyden`] makes the best of the factors, as in the integrator. The plain method and the second attempt factorise always.
+//! [`delmpc_mechanics::broyden`] makes the best of the factors, as in the integrator. The plain method and the second attempt factorise always.
 
+use delmpc_mechanics::broyden::Broyden;
 use delmpc_mechanics::newton_direction::{NewtonDirection, NewtonMethod, NewtonSolver};
 
-use crate::broyden::Broyden;
 use crate::one_step::{OneStep, Outcome, Progress};
 
 /// Iterations of the limited method from either start.

@@ -19,10 +19,10 @@
 //! Source: J. T. Betts, *Practical Methods for Optimal Control and Estimation Using Nonlinear Programming*, 2nd ed., SIAM 2010, section 4.5;
 //! M. Kelly, *An introduction to trajectory optimization*, SIAM Review 59, 2017, section 4; implicit form: the paper, section 5.
 
+use delmpc_mechanics::broyden::Broyden;
 use delmpc_mechanics::prelude::KinematicTree;
 
 use crate::articulated_body::ArticulatedBody;
-use crate::broyden::Broyden;
 use crate::inverse_dynamics_derivatives::InverseDynamics;
 use crate::pivoted_lu::PivotedLu;
 use crate::rigid_bodies::RivalError;

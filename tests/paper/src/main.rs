@@ -14,7 +14,7 @@
 //! | [`energy`], [`constrained`] | beyond: energy over 100 s; orders with the tip pinned |
 //! | problems | [`pendulum`], [`one_step`], [`trajectory`] |
 //! | rivals | [`quasi_newton`], [`automatic`], [`hermite_simpson`], [`runge_kutta`] on [`articulated_body`], [`inverse_dynamics_derivatives`] |
-//! | their tools | [`rigid_bodies`], [`pivoted_lu`], [`broyden`] |
+//! | their tools | [`rigid_bodies`], [`pivoted_lu`] |
 //! | ours | [`exact_newton`] and the integrators of `delmpc-mechanics` |
 //! | output | [`plot`], [`results`], [`stopwatch`] |
 //!
@@ -25,7 +25,6 @@
 
 mod articulated_body;
 mod automatic;
-mod broyden;
 mod constrained;
 mod energy;
 mod exact_newton;

@@ -1,4 +1,4 @@
-//! Broyden's method on top of the factors of an earlier Jacobian, as the integrator uses it ([`delmpc_mechanics::step`]).
+//! Broyden's method on top of the factors of an earlier Jacobian, as the integrator uses it ([`crate::step`]).
 //!
 //! Turns the simplified change `d = -J_0⁻¹ r` into the quasi-Newton change by the changes `s_0, s_1, ...` made since the factorisation:
 //!
@@ -6,7 +6,10 @@
 //! d := d + (s_j·d / |s_j|²) s_{j+1}   (j = 0, 1, ..., last - 1)          d := d / (1 - s_last·d / |s_last|²)
 //! ```
 //!
-//! Source: C. T. Kelley, *Iterative Methods for Linear and Nonlinear Equations*, SIAM 1995, section 7.3.
+//! Cost: O(m) for each of up to 8 remembered changes of `m` numbers. Source: C. T. Kelley, *Iterative Methods for Linear and Nonlinear Equations*, SIAM 1995, section 7.3.
+
+use alloc::vec;
+use alloc::vec::Vec;
 
 /// Changes remembered; later ones use these.
 const MEMORY: usize = 8;
@@ -21,7 +24,7 @@ pub struct Broyden {
 }
 
 impl Broyden {
-    /// For vectors of `order` numbers.
+    /// For vectors of `order` numbers. Allocates.
     pub fn new(order: usize) -> Self {
         Self { order, remembered: 0, changes: vec![0.0; MEMORY * order], squares: [0.0; MEMORY] }
     }
@@ -44,9 +47,9 @@ impl Broyden {
                 }
             } else if (1.0 - factor).abs() > 0.1 {
                 // A change that turns back on the last one: the simplified one is kept.
-                let scale = 1.0 / (1.0 - factor);
+                let scale = 1.0 - factor;
                 for x in change.iter_mut() {
-                    *x *= scale;
+                    *x /= scale;
                 }
             }
         }
@@ -59,7 +62,7 @@ impl Broyden {
     }
 }
 
-/// Scalar product in four partial sums.
+/// Scalar product in four partial sums: additions need not wait for each other.
 fn inner(a: &[f64], b: &[f64]) -> f64 {
     let mut sums = [0.0f64; 4];
     let (whole, other) = (a.chunks_exact(4), b.chunks_exact(4));
