@@ -18,6 +18,7 @@ use crate::setup::Setup;
 use crate::verdict::{Ended, Failure};
 
 pub mod canvas;
+pub mod colours;
 pub mod criteria;
 pub mod page;
 pub mod pictures;

@@ -3,6 +3,7 @@
 use delmpc_scenario::Clock;
 
 use crate::report::canvas::{Align, Canvas, CanvasError, Colour, Text};
+use crate::report::colours::{DASH, GRID, INK, PALETTE, SOFT, WHITE};
 use crate::report::recording::{Column, Recording, Table};
 use crate::setup::Setup;
 
@@ -12,26 +13,12 @@ const RIGHT: f32 = 28.0;
 const TOP: f32 = 92.0;
 const BOTTOM: f32 = 66.0;
 
-const WHITE: Colour = [255, 255, 255, 255];
-const INK: Colour = [23, 32, 43, 255];
-const SOFT: Colour = [85, 98, 115, 255];
-const GRID: Colour = [226, 231, 237, 255];
 const OUTSIDE: Colour = [213, 94, 0, 26];
 const REACH: Colour = [0, 158, 115, 22];
 const HOLD: Colour = [0, 158, 115, 44];
 const PUSH: Colour = [213, 94, 0, 60];
-/// Told apart by people who do not see all colours. Source: Okabe and Ito, "Color Universal Design" (2008).
-const PALETTE: [Colour; 6] = [
-    [0, 114, 178, 255],
-    [213, 94, 0, 255],
-    [0, 158, 115, 255],
-    [204, 121, 167, 255],
-    [230, 159, 0, 255],
-    [86, 180, 233, 255],
-];
 /// Joints drawn by their own lines: those that use most of their limits.
 const JOINTS: usize = 5;
-const DASH: Option<[f32; 2]> = Some([9.0, 7.0]);
 
 /// All pictures with their file names.
 ///

@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use crate::report::canvas::{Align, Canvas, Colour, Text};
+use crate::report::colours::{DASH, GRID, INK, PALETTE, SOFT, WHITE};
 use crate::timing::TimingReport;
 use crate::timing::phases::{LoopFigures, Quantity};
 use crate::verdict::Failure;
@@ -13,21 +14,6 @@ const LEFT: f32 = 118.0;
 const RIGHT: f32 = 56.0;
 const TOP: f32 = 124.0;
 const BOTTOM: f32 = 70.0;
-
-const WHITE: Colour = [255, 255, 255, 255];
-const INK: Colour = [23, 32, 43, 255];
-const SOFT: Colour = [85, 98, 115, 255];
-const GRID: Colour = [226, 231, 237, 255];
-/// Told apart by people who do not see all colours. Source: Okabe and Ito, "Color Universal Design" (2008).
-const PALETTE: [Colour; 6] = [
-    [0, 114, 178, 255],
-    [213, 94, 0, 255],
-    [0, 158, 115, 255],
-    [204, 121, 167, 255],
-    [230, 159, 0, 255],
-    [86, 180, 233, 255],
-];
-const DASH: Option<[f32; 2]> = Some([9.0, 7.0]);
 
 /// What a picture is drawn on.
 trait Sheet {
