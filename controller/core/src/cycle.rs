@@ -19,8 +19,8 @@ use alloc::boxed::Box;
 use alloc::vec;
 use alloc::vec::Vec;
 
-use delmpc_mechanics::inverse_dynamics::{InverseDynamicsWorkspace, gravity_force_into};
-use delmpc_messages::{Command, CycleReport, FallbackLevel, LARGEST_EFFORT, PlantState, Verdict};
+use delmpc_mechanics::inverse_dynamics::InverseDynamicsWorkspace;
+use delmpc_messages::{Command, CycleReport, FallbackLevel, PlantState, Verdict};
 use faer::MatRef;
 use nalgebra::Vector3;
 
@@ -38,9 +38,9 @@ use crate::lq_problem::LqProblem;
 use crate::model::ControllerModel;
 use crate::node_kinematics::NodeKinematics;
 use crate::plan::Plan;
-use crate::posture_goal::{posture_goal, reach_posture};
+use crate::posture_goal::posture_goal;
 use crate::projected_qp::{ProjectedQp, ProjectedQpReport, default_backend};
-use crate::reference::{Reach, Reference};
+use crate::reference::Reference;
 use crate::riccati::Riccati;
 use crate::stage_dynamics::StageDynamics;
 use crate::stop_watch::StopWatch;
@@ -48,6 +48,7 @@ pub use crate::stop_watch::{Clock, StoppedClock};
 use crate::tasks::TaskTargets;
 use crate::trajectory::Trajectory;
 
+mod goal;
 mod law_of_level;
 
 /// Reasons for refusing a state that are the controller's own ([`Command::reason`]); below 100 they are the message's.
@@ -497,74 +498,6 @@ impl Controller {
             near_posture: self.last_state_ns.is_some() && near_posture,
             blind_s,
         }
-    }
-
-    /// Cost and gain of standing still for ever, at the home posture.
-    fn solve_infinite_horizon(&mut self) -> Result<(), ControlError> {
-        let tree = &self.model.tree;
-        let n = tree.dof();
-        let mut x = vec![0.0; 2 * n];
-        x[..n].copy_from_slice(&self.model.posture);
-        self.node.update(tree, &x[..n], &x[n..])?;
-        let mut torque = vec![0.0; n];
-        gravity_force_into(tree, self.node.kinematics(), &mut self.gravity, &mut torque)?;
-        let last = self.config.stage_lengths().last().copied().unwrap_or(self.config.period_s);
-        let mut stand_still = |duration| {
-            self.horizon.stand_still(tree, &mut self.dynamics, &self.reference, (&x, &torque), duration)
-        };
-        let (coarse, fine) = (stand_still(last)?, stand_still(self.config.period_s)?);
-        self.horizon.set_terminal_cost(&coarse.cost_to_go);
-        self.static_law.gain.copy_from(&fine.gain);
-        let law = self.static_law.restart();
-        law.torque.copy_from_slice(&torque);
-        law.reference.copy_from_slice(&x);
-        for (j, limit) in self.model.limits.iter().enumerate() {
-            let effort = limit.effort.min(LARGEST_EFFORT);
-            (law.lower[j], law.upper[j]) = (-effort, effort);
-        }
-        law.clamp();
-        Ok(())
-    }
-
-    /// Stands in another posture from now on: solves the infinite-horizon problem there, for the terminal cost and the static law, and
-    /// gives a reach its new end. A new posture far from the old one is gone to in one go; go there in steps. Allocates.
-    ///
-    /// # Errors
-    /// [`ControlError`] for a posture that does not fit the model, or without a law that holds it; the old one stays then.
-    pub fn set_posture(&mut self, posture: &[f64]) -> Result<(), ControlError> {
-        let old = core::mem::replace(&mut self.model.posture, posture.to_vec());
-        let outcome = self.model.check().and_then(|()| self.stand_in_posture());
-        if outcome.is_err() {
-            self.model.posture = old;
-            // It had a law before.
-            self.stand_in_posture()?;
-        }
-        outcome
-    }
-
-    fn stand_in_posture(&mut self) -> Result<(), ControlError> {
-        self.prepared = None;
-        self.reference.home = posture_goal(&self.model, &self.model.posture)?;
-        self.solve_infinite_horizon()?;
-        self.set_reach(self.reference.reach.as_ref().map(|(reach, _)| *reach))
-    }
-
-    /// Sets or clears the reach and computes the posture it ends in. Allocates.
-    ///
-    /// # Errors
-    /// [`ControlError::Model`] when the model has no hand, [`ControlError::Mechanics`] when it does not fit.
-    pub fn set_reach(&mut self, reach: Option<Reach>) -> Result<(), ControlError> {
-        let Some(reach) = reach else {
-            self.reference.reach = None;
-            return Ok(());
-        };
-        if self.model.hand.is_none() {
-            return Err(ControlError::Model { reason: "a reach needs a hand point" });
-        }
-        let ball = Vector3::from(reach.ball_m);
-        let goal = reach_posture(&self.model, &self.reference.home, &ball, &self.config.weights)?;
-        self.reference.reach = Some((reach, goal));
-        Ok(())
     }
 
     /// Sets the plant time that counts as zero of the run; otherwise it is that of the first state.
