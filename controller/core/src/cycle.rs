@@ -39,10 +39,10 @@ use crate::model::ControllerModel;
 use crate::node_kinematics::NodeKinematics;
 use crate::plan::Plan;
 use crate::posture_goal::posture_goal;
+use crate::prediction::Prediction;
 use crate::projected_qp::{ProjectedQp, ProjectedQpReport, default_backend};
 use crate::reference::Reference;
 use crate::riccati::Riccati;
-use crate::stage_dynamics::StageDynamics;
 use crate::stop_watch::StopWatch;
 pub use crate::stop_watch::{Clock, StoppedClock};
 use crate::tasks::TaskTargets;
@@ -77,6 +77,8 @@ pub mod reason {
 const GAVE_WAY: f64 = 1e-3;
 /// A plan that moves a node by more than this (rad, m) is not believed.
 const LARGEST_MOVE: f64 = 2.0;
+/// How much later than the nominal's start a state may be, s: half the time that a command's segments cover.
+const LATEST_STATE_S: f64 = 0.05;
 /// Cycles in a row with a large innovation before [`Verdict::ModelMismatch`].
 const MISMATCH_CYCLES: u32 = 5;
 /// Part of a new difference between planned and measured force that counts at once.
@@ -96,7 +98,6 @@ pub struct Controller {
     trim: BalanceTrim,
     targets: TaskTargets,
 
-    dynamics: StageDynamics,
     gravity: InverseDynamicsWorkspace,
     node: NodeKinematics,
 
@@ -118,6 +119,7 @@ pub struct Controller {
     /// Time of the first node the present factors belong to, s of the run.
     factors_start_s: f64,
 
+    prediction: Prediction,
     /// State predicted for the time of the command.
     predicted: Vec<f64>,
     predicted_for_s: f64,
@@ -189,7 +191,6 @@ impl Controller {
             reference: Reference { home, reach: None, com_shift: Vector3::zeros() },
             trim: BalanceTrim::new(config.trim_s),
             targets: TaskTargets::new(n),
-            dynamics: StageDynamics::new(tree)?,
             gravity: InverseDynamicsWorkspace::new(tree),
             node: NodeKinematics::new(tree),
             horizon,
@@ -204,12 +205,13 @@ impl Controller {
             cycle_began_ns: 0,
             preparations_ns: [0; 3],
             factors_start_s: 0.0,
+            prediction: Prediction::new(tree, config.servo_period_s),
             predicted: vec![0.0; 2 * n],
             predicted_for_s: 0.0,
             has_prediction: false,
             surprising_cycles: 0,
             innovation_rate: 0.0,
-            scratch: vec![0.0; 4 * n],
+            scratch: vec![0.0; 2 * n],
             planned_force: None,
             force_change: Vector3::zeros(),
             static_law: Law::new(n),
@@ -369,38 +371,39 @@ impl Controller {
         self.predicted[n..].copy_from_slice(q_dot);
         let mut start_s = (measured_s + self.config.delay_s).max(self.run_time_s(now_ns));
         let ahead_s = self.nominal.start_s;
-        // A tick that was missed makes the state later than prepared for, but a plan that begins at the state is still a plan; so is one
+        // A tick that was missed makes the state later than prepared for, but what was prepared is still good for a plan; so it is for one
         // that begins a little later than it could. Doing all of it again would miss the next tick too.
-        let (earliest_s, latest_s) = (measured_s - 1e-9, start_s + self.config.period_s + 1e-9);
-        if self.prepared.is_some() && (earliest_s..=latest_s).contains(&ahead_s) {
+        let (earliest_s, latest_s) = (measured_s - LATEST_STATE_S, start_s + self.config.period_s);
+        if self.prepared.is_some() && (earliest_s - 1e-9..=latest_s + 1e-9).contains(&ahead_s) {
             start_s = ahead_s;
         }
-        self.predict(measured_s, start_s - measured_s).map_err(|()| reason::PREDICTION)?;
+        self.has_prediction = start_s >= measured_s - 1e-9;
+        if self.has_prediction {
+            self.predict(measured_s, start_s - measured_s).map_err(|()| reason::PREDICTION)?;
+        } else {
+            self.carry_back(measured_s);
+        }
         self.predicted_for_s = start_s;
-        self.has_prediction = true;
         Ok(start_s)
     }
 
-    /// Moves `predicted` forward under the laws of the last commands, in the steps of the servo: their gains are too stiff for longer
-    /// ones.
+    /// Moves `predicted` back to the start of the nominal: the deviation from it then is taken to be the one measured now.
+    fn carry_back(&mut self, measured_s: f64) {
+        let passed = &mut self.scratch[..self.predicted.len()];
+        self.nominal.state_at(measured_s, passed);
+        for ((x, passed), first) in self.predicted.iter_mut().zip(passed).zip(self.nominal.values.x(0)) {
+            *x += first - *passed;
+        }
+    }
+
+    /// Moves `predicted` forward under the laws of the last commands.
     fn predict(&mut self, measured_s: f64, duration_s: f64) -> Result<(), ()> {
         if duration_s <= 0.0 || self.command.state_sequence == 0 {
             return Ok(());
         }
-        let n = self.model.tree.dof();
-        let steps = libm::ceil(duration_s / self.config.servo_period_s - 1e-9).max(1.0);
-        let time_step = duration_s / steps;
-        let (error, rest) = self.scratch.split_at_mut(2 * n);
-        let (torque, _) = rest.split_at_mut(n);
-        let tree = &self.model.tree;
-        self.dynamics.set_time_step(time_step).map_err(|_| ())?;
-        self.dynamics.begin(tree, &self.predicted).map_err(|_| ())?;
-        for step in 0..steps as usize {
-            let (elapsed_s, law) = self.past_laws.at(measured_s + step as f64 * time_step);
-            law.torque_at(elapsed_s, &self.predicted, error, torque);
-            self.dynamics.advance(tree, torque, &mut self.predicted).map_err(|_| ())?;
-        }
-        if all_finite(&self.predicted) { Ok(()) } else { Err(()) }
+        let Self { prediction, model, past_laws, predicted, .. } = self;
+        prediction.advance(&model.tree, past_laws, measured_s, duration_s, predicted).map_err(|_| ())?;
+        if all_finite(predicted) { Ok(()) } else { Err(()) }
     }
 
     /// Compares the measurement with what the last cycle predicted for its time.

@@ -13,7 +13,7 @@
 //!
 //! Reading order: [`model`], [`config`], [`cycle`]; then in the order of the cycle [`estimator`], [`plan`], [`horizon_dynamics`], [`stage_dynamics`],
 //! [`node_kinematics`], [`tasks`], [`mod@reference`], [`contact_wrench`], [`lq_problem`], [`riccati`], [`dare`], [`projected_qp`],
-//! [`dual_qp`], [`fallback`]. Files without public items: `feedback_law.rs` (what a command carries), `balance_trim.rs` (wrong masses).
+//! [`dual_qp`], [`fallback`]. Files without public items: `feedback_law.rs` (what a command carries), `balance_trim.rs` (wrong masses), `prediction.rs` (delay).
 #![allow(clippy::needless_range_loop)]
 #![cfg_attr(not(feature = "std"), no_std)]
 #![forbid(unsafe_code)]
@@ -47,6 +47,7 @@ pub mod node_kinematics;
 mod panel;
 pub mod plan;
 pub mod posture_goal;
+mod prediction;
 pub mod projected_qp;
 pub mod reference;
 pub mod riccati;

@@ -5,8 +5,8 @@
 //! ```
 //!
 //! with the composite inertia `𝓜_j` and momentum `μ_j` of everything beyond joint j, all about the origin of {0}. The second one is
-//! (I3), (I4) of the mechanics handbook summed over the subtree: with `η = S_j` and `ν = Ṡ_j` for every body beyond j,
-//! `δ(M v) = M ν - ad^D_{M v} η`. Mass centre: `m ċ` is the linear part of `P`, so `∂c/∂q = ∂ċ/∂q̇` is that of `𝓜_j S_j / m`.
+//! the change of a body's momentum `M v` when the body is displaced by the twist `η` and its velocity changes by `ν` on the moved body,
+//! `δ(M v) = M ν - ad^D_{M v} η`, summed over the subtree with `η = S_j`, `ν = Ṡ_j`. Mass centre: `m ċ` is the linear part of `P`, so `∂c/∂q = ∂ċ/∂q̇` is that of `𝓜_j S_j / m`.
 //!
 //! A node is evaluated by itself ([`NodeKinematics::update`]) or taken from a stage-parallel linearisation, which has all of this at
 //! hand ([`NodeKinematics::take_all`]).

@@ -35,7 +35,6 @@ pub struct StageDynamics {
     linearizer: Linearizer,
     time_step: f64,
     state: State,
-    rate: Vec<f64>,
     end: Vec<f64>,
 }
 
@@ -50,8 +49,8 @@ impl StageDynamics {
         let options = StepOptions { accuracy: ACCURACY, ..StepOptions::default() };
         let integrator = Integrator::new(tree, &rule, time_step, options)?;
         let linearizer = Linearizer::new(tree, &integrator, StateCoordinates::Velocity, InputHold::Held)?;
-        let (rate, end) = (vec![0.0; tree.dof()], vec![0.0; 2 * tree.dof()]);
-        Ok(Self { integrator, linearizer, time_step, state: State::zeros(tree), rate, end })
+        let (state, end) = (State::zeros(tree), vec![0.0; 2 * tree.dof()]);
+        Ok(Self { integrator, linearizer, time_step, state, end })
     }
 
     /// Simulates one stage of `time_step` (s) from `x = (q, q̇)` under the held torque `u` and fills `next` with its end.
@@ -66,46 +65,19 @@ impl StageDynamics {
         time_step: f64,
         next: &mut [f64],
     ) -> Result<(), StepError> {
-        self.set_time_step(time_step)?;
-        self.begin(tree, x)?;
-        self.advance(tree, u, next)
-    }
-
-    /// Length of the steps from now on, s.
-    ///
-    /// # Errors
-    /// Unless it is positive and finite.
-    pub fn set_time_step(&mut self, time_step: f64) -> Result<(), StepError> {
         if time_step != self.time_step {
             self.integrator.set_time_step(time_step)?;
             self.time_step = time_step;
         }
-        Ok(())
-    }
-
-    /// Takes `x = (q, q̇)` for the start of a motion that [`StageDynamics::advance`] goes on with.
-    ///
-    /// # Errors
-    /// When `x` does not fit.
-    pub fn begin(&mut self, tree: &KinematicTree, x: &[f64]) -> Result<(), StepError> {
-        let (q, q_dot) = x.split_at(tree.dof());
+        let n = tree.dof();
+        let (q, q_dot) = x.split_at(n);
         self.state.q.copy_from_slice(q);
         self.integrator.velocities().set_velocity(tree, &mut self.state, q_dot)?;
-        Ok(())
-    }
-
-    /// One more step of the same length, under the held torque `u`; fills `next` with its end. Keeps the momentum from step to step,
-    /// so that the next one starts from the extrapolation of this one.
-    ///
-    /// # Errors
-    /// As [`StageDynamics::simulate`].
-    pub fn advance(&mut self, tree: &KinematicTree, u: &[f64], next: &mut [f64]) -> Result<(), StepError> {
-        let n = tree.dof();
         self.integrator.solve(tree, &self.state, &StepForces::held(u))?;
         self.state.copy_from(self.integrator.next_state());
-        self.integrator.velocities().velocity_into(tree, &self.state, &mut self.rate)?;
-        next[..n].copy_from_slice(&self.state.q);
-        next[n..].copy_from_slice(&self.rate);
+        let (q, q_dot) = next.split_at_mut(n);
+        q.copy_from_slice(&self.state.q);
+        self.integrator.velocities().velocity_into(tree, &self.state, q_dot)?;
         Ok(())
     }
 

@@ -166,7 +166,10 @@ fn a_machine_that_is_too_slow_prepares_for_the_tick_it_can_meet() {
     assert_eq!(cycle(&mut controller, 10 * PERIOD_NS), (true, 12 * PERIOD_NS));
     prepare(&mut controller, 100_000);
     assert_eq!(cycle(&mut controller, 11 * PERIOD_NS), (true, 12 * PERIOD_NS));
-    // Far too late for what was prepared: made again.
+    // Some periods too late for what was prepared: it serves, for the time from now on.
     prepare(&mut controller, 100_000);
-    assert_eq!(cycle(&mut controller, 17 * PERIOD_NS), (false, 18 * PERIOD_NS));
+    assert_eq!(cycle(&mut controller, 17 * PERIOD_NS), (true, 18 * PERIOD_NS));
+    // Far too late: made again.
+    prepare(&mut controller, 100_000);
+    assert_eq!(cycle(&mut controller, 35 * PERIOD_NS), (false, 36 * PERIOD_NS));
 }

@@ -10,6 +10,7 @@ use super::Controller;
 use crate::errors::ControlError;
 use crate::posture_goal::{posture_goal, reach_posture};
 use crate::reference::Reach;
+use crate::stage_dynamics::StageDynamics;
 
 impl Controller {
     /// Cost and gain of standing still for ever, at the home posture.
@@ -22,8 +23,9 @@ impl Controller {
         let mut torque = vec![0.0; n];
         gravity_force_into(tree, self.node.kinematics(), &mut self.gravity, &mut torque)?;
         let last = self.config.stage_lengths().last().copied().unwrap_or(self.config.period_s);
+        let mut dynamics = StageDynamics::new(tree)?;
         let mut stand_still = |duration| {
-            self.horizon.stand_still(tree, &mut self.dynamics, &self.reference, (&x, &torque), duration)
+            self.horizon.stand_still(tree, &mut dynamics, &self.reference, (&x, &torque), duration)
         };
         let (coarse, fine) = (stand_still(last)?, stand_still(self.config.period_s)?);
         self.horizon.set_terminal_cost(&coarse.cost_to_go);
