@@ -60,7 +60,7 @@ pub struct ControllerPart {
 
 /// The whole summary: flat keys, SI units.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-#[allow(missing_docs, reason = "the names are those of the handbook and say it all")]
+#[allow(missing_docs, reason = "the names say it all")]
 pub struct Summary {
     pub scenario: String,
     pub seed: u64,
@@ -123,7 +123,7 @@ impl Summary {
     }
 }
 
-/// The keys of the handbook, none of which may ever be missing.
+/// The keys that others read: none of them may ever be missing.
 pub const KEYS: [&str; 46] = [
     "scenario",
     "seed",

@@ -86,7 +86,7 @@ fn without_a_controller_the_robot_falls_and_the_command_says_so() {
 }
 
 #[test]
-fn the_summary_has_every_key_of_the_handbook() {
+fn the_summary_has_every_key() {
     let keys = "scenario, seed, success, failure, duration_s, clock, steps, fell, fall_time_s, min_com_height_m, \
         max_stance_slip_m, max_stance_tilt_rad, min_cop_margin_m, max_friction_use, max_torque_ratio, \
         hand_error_at_deadline_m, hand_error_hold_max_m, push_impulse_ns, push_direction, recovered, settle_time_s, cycles, \

@@ -1,4 +1,5 @@
-//! A box on the ground: rest, friction, impact, tipping, rocking. Tolerances are those of the handbook's contact chapter, section 8.
+//! A box on the ground: rest, friction, impact, tipping, rocking. What is checked has a closed form; tolerances allow for the compliance
+//! of the ground and one step of time.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod common;

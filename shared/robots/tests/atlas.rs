@@ -1,4 +1,4 @@
-//! Atlas: every number of the handbook, floating and on its right foot.
+//! Atlas: the expected numbers of `tests/vectors/robots`, floating and on its right foot.
 
 mod common;
 

@@ -1,4 +1,4 @@
-//! LittleDog and Spring Flamingo: the numbers of the handbook.
+//! LittleDog and Spring Flamingo: the expected numbers of `tests/vectors/robots`.
 
 mod common;
 
