@@ -42,7 +42,7 @@
 //! Cost: one rollout O(N n²) per round, one sweep O(j n²) per row, one small QP per round. No allocation after
 //! [`ProjectedQp::new`], other than the backend's.
 //!
-//! Source: own formulation (design section 5.6); the dual of a projection: S. Boyd, L. Vandenberghe, *Convex Optimization*, 2004,
+//! Source: own formulation; the dual of a projection: S. Boyd, L. Vandenberghe, *Convex Optimization*, 2004,
 //! section 5.2; exact penalty: R. Fletcher, *Practical Methods of Optimization*, 1987, section 12.3.
 
 use alloc::boxed::Box;
