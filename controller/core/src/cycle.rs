@@ -79,6 +79,8 @@ const GAVE_WAY: f64 = 1e-3;
 const LARGEST_MOVE: f64 = 2.0;
 /// How much later than the nominal's start a state may be, s: half the time that a command's segments cover.
 const LATEST_STATE_S: f64 = 0.05;
+/// How much earlier than it was prepared for a state may be, in periods: the last command covers the time in between.
+const EARLIEST_PERIODS: f64 = 2.0;
 /// Cycles in a row with a large innovation before [`Verdict::ModelMismatch`].
 const MISMATCH_CYCLES: u32 = 5;
 /// Part of a new difference between planned and measured force that counts at once.
@@ -373,7 +375,8 @@ impl Controller {
         let ahead_s = self.nominal.start_s;
         // A tick that was missed makes the state later than prepared for, but what was prepared is still good for a plan; so it is for one
         // that begins a little later than it could. Doing all of it again would miss the next tick too.
-        let (earliest_s, latest_s) = (measured_s - LATEST_STATE_S, start_s + self.config.period_s);
+        let (earliest_s, latest_s) =
+            (measured_s - LATEST_STATE_S, start_s + EARLIEST_PERIODS * self.config.period_s);
         if self.prepared.is_some() && (earliest_s - 1e-9..=latest_s + 1e-9).contains(&ahead_s) {
             start_s = ahead_s;
         }

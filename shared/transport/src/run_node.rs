@@ -24,6 +24,9 @@ use crate::{Channel, LinkError, Payload, RunId, SharedPublisher, SharedSubscribe
 
 const MAX_SUBSCRIBERS: usize = 8;
 const MAX_PROCESSES: usize = 16;
+/// Publishers that are gone of which a subscriber still holds messages: one gives out one message and looks at another. Every look for a
+/// message goes through the room for them, so that iceoryx2's 128 cost a tenth of a microsecond each time.
+const MAX_LOST_PUBLISHERS: usize = 2;
 /// The attribute of a channel that says which joints it is about.
 const JOINT_SET: &str = "joint_set_hash";
 /// A peer that is just being started, ended or cleaned up after a kill makes opening fail for a moment. All attempts together take longer
@@ -264,6 +267,7 @@ pub(crate) fn config_of(run: RunId) -> Result<Config, LinkError> {
     config.global.prefix = prefix_name.map_err(|_| unusable(prefix.as_ref()))?;
     let root_name = iceoryx2::prelude::Path::new(root.as_os_str().as_encoded_bytes());
     config.global.creation_timeout = CREATION_PATIENCE;
+    config.defaults.publish_subscribe.subscriber_expired_connection_buffer = MAX_LOST_PUBLISHERS;
     config.global.node.cleanup_dead_nodes_on_destruction = false; // ending must not wait for anybody
     config.global.set_root_path(&root_name.map_err(|_| unusable(&root))?);
     Ok(config)
