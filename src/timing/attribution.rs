@@ -164,6 +164,11 @@ impl Account {
         self.wall_ns.saturating_sub(self.taken_ns + self.plant_ns)
     }
 
+    /// Time without what the plant had of the core: that is no disturbance, but not the cycle's either.
+    pub fn computing_ns(&self) -> u64 {
+        self.wall_ns.saturating_sub(self.plant_ns)
+    }
+
     /// Whether the machine interfered: took the core for `event_ns`, woke the thread up that late, or was slow.
     pub fn is_disturbed(&self, event_ns: u64) -> bool {
         self.taken_ns >= event_ns || self.late_ns >= event_ns || self.slowness >= SLOW
@@ -202,6 +207,21 @@ pub struct RobotThen {
     pub cop_margin_before_m: f64,
     /// The least after.
     pub cop_margin_least_m: f64,
+}
+
+/// A cycle that took long though nothing of the machine's interfered.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct LongCycle {
+    /// When its tick was due, from the first cycle on.
+    pub time_s: f64,
+    /// The stage that took most above its median.
+    pub stage: Stage,
+    /// By how much.
+    pub excess_s: f64,
+    /// Solves of the constrained QP.
+    pub qp_solves: u32,
+    /// Where the time went.
+    pub account: Account,
 }
 
 /// What a judge needs besides the cycles.
@@ -277,8 +297,7 @@ pub fn accounts(cycles: &[CycleRecord], evidence: &Evidence<'_>) -> Vec<Account>
 
 /// Every missed deadline with its cause.
 pub fn misses(cycles: &[CycleRecord], accounts: &[Account], evidence: &Evidence<'_>) -> Vec<Miss> {
-    let medians = Stage::ALL
-        .map(|stage| Times::of(cycles.iter().map(|cycle| stage.time_ns(cycle))).at_ns(0.5).unwrap_or(0));
+    let medians = stage_medians(cycles);
     let origin_ns = cycles.first().map_or(0, |cycle| cycle.due_ns);
     let mut list: Vec<Miss> = Vec::new();
     // Cause of the last cycle, if it missed its deadline.
@@ -296,14 +315,12 @@ pub fn misses(cycles: &[CycleRecord], accounts: &[Account], evidence: &Evidence<
         if !overran {
             continue;
         }
-        let excess = |(stage, median): &(Stage, u64)| stage.time_ns(cycle).saturating_sub(*median);
-        let worst = Stage::ALL.into_iter().zip(medians).max_by_key(excess);
         list.push(Miss {
             time_s: (cycle.due_ns - origin_ns) as f64 * 1e-9,
             deadlines: 1,
             overrun_s: (cycle.sent_ns - deadline_ns) as f64 * 1e-9,
             cause,
-            stage: worst.map_or(Stage::Rest, |(stage, _)| stage),
+            stage: most_above(&medians, cycle).0,
             account: *account,
             involuntary_switches: cycle.involuntary_switches,
             page_faults: cycle.minor_faults + cycle.major_faults,
@@ -311,6 +328,43 @@ pub fn misses(cycles: &[CycleRecord], accounts: &[Account], evidence: &Evidence<
         });
     }
     list
+}
+
+/// The longest cycles in which the machine did not interfere, at most `count`, the longest first.
+pub fn longest_undisturbed(
+    cycles: &[CycleRecord],
+    accounts: &[Account],
+    evidence: &Evidence<'_>,
+    count: usize,
+) -> Vec<LongCycle> {
+    let medians = stage_medians(cycles);
+    let origin_ns = cycles.first().map_or(0, |cycle| cycle.due_ns);
+    let undisturbed = cycles.iter().zip(accounts);
+    let mut found: Vec<_> =
+        undisturbed.filter(|(_, account)| !account.is_disturbed(evidence.event_ns)).collect();
+    found.sort_by_key(|(_, account)| core::cmp::Reverse(account.computing_ns()));
+    let long = |(cycle, account): (&CycleRecord, &Account)| {
+        let (stage, excess_ns) = most_above(&medians, cycle);
+        LongCycle {
+            time_s: (cycle.due_ns - origin_ns) as f64 * 1e-9,
+            stage,
+            excess_s: excess_ns as f64 * 1e-9,
+            qp_solves: cycle.qp_solves,
+            account: *account,
+        }
+    };
+    found.into_iter().take(count).map(long).collect()
+}
+
+fn stage_medians(cycles: &[CycleRecord]) -> [u64; 8] {
+    Stage::ALL.map(|stage| Times::of(cycles.iter().map(|cycle| stage.time_ns(cycle))).at_ns(0.5).unwrap_or(0))
+}
+
+/// The stage of a cycle that took most above its median, and by how much (ns).
+fn most_above(medians: &[u64; 8], cycle: &CycleRecord) -> (Stage, u64) {
+    let excess = |(stage, median): (Stage, &u64)| (stage, stage.time_ns(cycle).saturating_sub(*median));
+    let worst = Stage::ALL.into_iter().zip(medians).map(excess).max_by_key(|(_, excess)| *excess);
+    worst.unwrap_or((Stage::Rest, 0))
 }
 
 fn cause_of(account: &Account, inherited: Option<Cause>, evidence: &Evidence<'_>) -> Cause {

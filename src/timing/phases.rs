@@ -10,7 +10,9 @@ use serde::Serialize;
 
 use crate::setup::Setup;
 use crate::supervisor::Course;
-use crate::timing::attribution::{Account, Cause, Evidence, Miss, Stage, Witness, accounts, misses};
+use crate::timing::attribution::{
+    Account, Cause, Evidence, LongCycle, Miss, Stage, Witness, accounts, longest_undisturbed, misses,
+};
 use crate::timing::co_load::{CoLoad, LoadDone};
 use crate::timing::figures::{Bar, Figures, Times};
 use crate::timing::floor::{FloorRun, FloorSettings, FloorThread, Work, deadlines, missed_deadlines, stalls};
@@ -88,6 +90,8 @@ pub struct LoopFigures {
     pub disturbed_cycles: u64,
     /// 99.9 % over the median of the cycles' computing time, in undisturbed cycles.
     pub compute_spread: Option<f64>,
+    /// The longest of these.
+    pub longest_undisturbed: Vec<LongCycle>,
     /// The longest a cycle itself computed (s).
     pub own_time_max_s: f64,
     /// Deadlines: cycles, and ticks that were slept through.
@@ -131,6 +135,8 @@ pub struct Counts {
 
 /// Misses kept one by one in the report.
 const MISSES_KEPT: usize = 1000;
+/// Long cycles that are reported.
+const LONGEST_KEPT: usize = 5;
 
 /// What all phases work with.
 #[derive(Debug)]
@@ -298,8 +304,7 @@ fn loop_figures(scenario: &Scenario, run: &LoopRun, load: Option<LoadDone>) -> L
     misses.truncate(MISSES_KEPT);
     let disturbed = |account: &&Account| account.is_disturbed(event_ns);
     let undisturbed = accounts.iter().filter(|account| !disturbed(account));
-    // The plant's time is no disturbance, but not the cycle's either.
-    let calm = Times::of(undisturbed.map(|account| account.wall_ns - account.plant_ns.min(account.wall_ns)));
+    let calm = Times::of(undisturbed.map(Account::computing_ns));
     let spread = calm.at_ns(0.999).zip(calm.at_ns(0.5)).map(|(high, median)| high as f64 / median as f64);
     let (plant, controller) = (run.summary.plant.as_ref(), run.summary.controller.as_ref());
     LoopFigures {
@@ -333,6 +338,7 @@ fn loop_figures(scenario: &Scenario, run: &LoopRun, load: Option<LoadDone>) -> L
             .collect(),
         disturbed_cycles: accounts.iter().filter(disturbed).count() as u64,
         compute_spread: spread,
+        longest_undisturbed: longest_undisturbed(&run.cycles, &accounts, &evidence, LONGEST_KEPT),
         own_time_max_s: accounts.iter().map(Account::own_ns).max().unwrap_or(0) as f64 * 1e-9,
         deadlines: run.cycles.iter().map(|cycle| 1 + u64::from(cycle.missed_ticks)).sum(),
         missed: missed_by.iter().sum(),

@@ -126,6 +126,19 @@ fn one_loop(text: &mut String, figures: &LoopFigures) {
             load.system_calls as f64 * 1e-6
         );
     }
+    for long in &figures.longest_undisturbed {
+        let _ = writeln!(
+            text,
+            "  undisturbed, and long, at {:8.3} s: {:.3} ms, slowness {:.1}, pace {:.1}, QP solves {}; most in {}, {:.3} ms above its median",
+            long.time_s,
+            long.account.computing_ns() as f64 * 1e-6,
+            long.account.slowness,
+            long.account.pace,
+            long.qp_solves,
+            long.stage.name(),
+            1e3 * long.excess_s
+        );
+    }
     for miss in figures.misses.iter().take(MISSES_SHOWN) {
         let ms = |ns: u64| ns as f64 * 1e-6;
         let _ = write!(
