@@ -17,7 +17,7 @@
 //! |---|---|
 //! | the machine, by taking the core | the own time is within the budget, and at least `event_s` was taken |
 //! | the machine, by being slow | the slowness is at least [`SLOW`], and the own time over the pace is within the budget |
-//! | as the cycle before | that one missed its deadline and was still under way |
+//! | as the cycle before | that one was still under way at the tick |
 //! | the plant, on a shared core | the own time is within the budget, and the plant had the core for longer than the machine took it |
 //! | the software | everything else, also where nothing explains it |
 
@@ -300,7 +300,7 @@ pub fn misses(cycles: &[CycleRecord], accounts: &[Account], evidence: &Evidence<
     let medians = stage_medians(cycles);
     let origin_ns = cycles.first().map_or(0, |cycle| cycle.due_ns);
     let mut list: Vec<Miss> = Vec::new();
-    // Cause of the last cycle, if it missed its deadline.
+    // Cause of the last cycle, if it was still under way at the end of its period.
     let mut before: Option<Cause> = None;
     for (cycle, account) in cycles.iter().zip(accounts) {
         let deadline_ns = cycle.due_ns + evidence.period_ns;
@@ -311,7 +311,8 @@ pub fn misses(cycles: &[CycleRecord], accounts: &[Account], evidence: &Evidence<
         }
         let inherited = before.filter(|_| account.backlog_ns > 0);
         let cause = cause_of(account, inherited, evidence);
-        before = overran.then_some(cause);
+        // A command in time does not mean that the cycle was over in time.
+        before = (cycle.done_ns > deadline_ns).then_some(cause);
         if !overran {
             continue;
         }
@@ -500,6 +501,11 @@ mod tests {
         assert_eq!(judge(&cycles, &[], &[]), [(Cause::Machine, 2), (Cause::Machine, 1)]);
         cycles[0].cpu_ns = 12 * MS;
         assert_eq!(judge(&cycles, &[], &[]), [(Cause::Software, 2), (Cause::Software, 1)]);
+        // Its command in time, and what it prepared for the next one held up.
+        cycles[0].sent_ns = MS;
+        assert_eq!(judge(&cycles, &[], &[]), [(Cause::Software, 1)]);
+        cycles[0].cpu_ns = 3 * MS;
+        assert_eq!(judge(&cycles, &[], &[]), [(Cause::Machine, 1)]);
     }
 
     #[test]
