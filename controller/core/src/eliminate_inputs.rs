@@ -216,10 +216,9 @@ impl EliminateInputs<'_> {
                 }
             }
         }
-        // Above the diagonal the panel holds what the tiles left there.
+        // Above the diagonal the panel holds what the tiles left there; zeros stay in the factor.
         for j in 0..inputs {
             let column = self.factors.input_factor.column_mut(j);
-            column[..j].fill(0.0);
             column[j..].copy_from_slice(&panel.column(j)[j..self.layout.first_state()]);
         }
         true
