@@ -51,7 +51,7 @@ use crate::lanes::{
     store,
 };
 use crate::lobatto::MAX_UNKNOWN_NODES;
-use crate::newton_direction::{NewtonDirection, base_matrix, second_order_matrix};
+use crate::newton_direction::{NewtonDirection, base_matrix, held_rows_matrix, second_order_matrix};
 use crate::recursive_linearize::{BodyFactors, Responses};
 use crate::row_matrix::RowMatrix;
 use crate::small_inverse::invert;
@@ -865,6 +865,14 @@ impl RecursiveNewton {
             }
         }
         nodes.add_t(del, s, entries);
+        for alpha in 0..s {
+            let held = held_rows_matrix(del, alpha);
+            for k in 0..6 {
+                for l in 0..6 {
+                    entries[(k * s + alpha) * order + l * s + s - 1] -= held[(k, l)];
+                }
+            }
+        }
         self.base.lu.factor().map_err(|(_, pivot)| FactorError::SingularPivot { body: 0, pivot })
     }
 

@@ -8,15 +8,15 @@
 //! | `θ` | contraction: size of a change relative to the one before |
 //!
 //! **Start.** The interpolation polynomial of the step before is extrapolated, `q^α := Σ_β l_β(1 + c_α) q_prev^β`, when the step
-//! continues where the last one ended (a floating base: in the chart of the last step, then moved to the new one). What the last
-//! extrapolation missed is added: it changes little from step to step, so that the guess gains an order; and where it has changed
-//! steadily, its trend, for another order. Else
-//! `q^α = q^0 + c_α Δt M⁻¹p`; if Newton fails from there, `q^α = q^0`.
+//! continues where the last one ended (a floating base: in the chart of the last step, then moved to the new one). What that is
+//! expected to miss, going by the last steps (`missed.rs`), is added. Else `q^α = q^0 + c_α Δt M⁻¹p`; if Newton fails from there,
+//! `q^α = q^0`.
 //!
 //! **Iteration.** `J` is factorised once and kept while the iteration contracts (simplified Newton), also over the steps that
 //! continue the motion and after a linearisation: it changes by `O(Δt)` from step to step, and a factorisation costs as much as
 //! two or three iterations. When old factors take more iterations than new ones are worth, the next step makes new ones; when
-//! they do not contract (light links at high accelerations), the next sixteen do. Broyden's update on top of the factors costs a few scalar products and saves about one iteration. `J`
+//! they do not contract (light links at high accelerations), the next sixteen do. Broyden's update on top of the factors, and what the
+//! step before tells about them ([`crate::broyden`]), cost a few scalar products and save one or two iterations. `J`
 //! is renewed when `θ` exceeds 0.1. A change may be limited to [`StepOptions::change_limit`] in the largest angle, a trust region
 //! without a merit function: on a 32-link chain at steps of 40 ms (trapezoidal, random states, `tests/paper`) it raises the share of
 //! solved steps from 0.5 to 0.9.
@@ -25,7 +25,8 @@
 //! when the next change is predicted below [`StepOptions::accuracy`] times `1 + max|q|`, by default 1e-16: what is left of it accumulates in the momenta over many steps
 //! (stopping at 1e-14 left 1e-10 in an exactly conserved momentum after 500 steps). With old factors the prediction is linear in the
 //! change, and when round-off hides a contraction, those before it count; with the factors of the guess the second change is as the square of the first, and their ratio in an earlier step, times ten
-//! for safety, may end the iteration at the first. Or when the change is below `1e-8` and no longer shrinks: round-off.
+//! for safety, may end the iteration at the first. Or when the change is below `1e-8` and no longer shrinks: round-off. With old factors
+//! a change of 1e-14 is the last but one, and none below 1e-13 says that they do not contract.
 //!
 //! Source: the paper, section 3.2 (there `δq = -J r`; the inverse is missing in print); Broyden's method in the form of
 //! C. T. Kelley, *Iterative Methods for Linear and Nonlinear Equations*, SIAM 1995, section 7.3.
@@ -48,8 +49,14 @@ use crate::state::State;
 use crate::tree::{JointKind, KinematicTree};
 use crate::velocity::VelocityWorkspace;
 
-/// A change below this (times `1 + max|q|`) is converged without prediction.
+mod missed;
+
+use missed::Missed;
+
+/// A change below this (times `1 + max|q|`) is round-off: with the factors of the guess it is the last one.
 const SMALL_CHANGE: f64 = 1e-14;
+/// A change above this (times `1 + max|q|`) tells how the iteration contracts; below, it may be round-off.
+const CLEAN_CHANGE: f64 = 1e-13;
 /// Below this the iteration may stop when it no longer shrinks: round-off.
 const STAGNATION_CHANGE: f64 = 1e-8;
 /// Contraction above which the Newton matrix is renewed.
@@ -163,14 +170,9 @@ pub struct Integrator {
     /// Chart centre of a floating base in the last step.
     previous_center: RigidTransform,
     has_previous: bool,
-    /// Nodes as extrapolated, and what the last extrapolation missed: `dof * s + α - 1`.
+    /// Nodes as extrapolated, `dof * s + α - 1`, and what that missed.
     extrapolated: Vec<f64>,
-    missed: Vec<f64>,
-    /// What the extrapolation before that missed.
-    missed_before: Vec<f64>,
-    /// How many of the two are known, and whether their trend told the last one better than the one before it.
-    known_missed: usize,
-    follows_trend: bool,
+    missed: Missed,
     /// The solver holds the factors of a Newton matrix of this motion.
     factored: bool,
     /// Iterations of the last step with new factors and a full guess; zero before the first one.
@@ -224,10 +226,7 @@ impl Integrator {
             previous_center: RigidTransform::identity(),
             has_previous: false,
             extrapolated: vec![0.0; order],
-            missed: vec![0.0; order],
-            missed_before: vec![0.0; order],
-            known_missed: 0,
-            follows_trend: false,
+            missed: Missed::new(order),
             factored: false,
             new_factor_iterations: 0,
             reuse_pause: 0,
@@ -281,7 +280,7 @@ impl Integrator {
                 return self.keep(tree, report);
             }
         }
-        self.known_missed = 0;
+        self.missed.forget();
         self.factored = false;
         self.guess_by_velocity(tree, state)?;
         let mut outcome = self.newton(tree, forces, &mut report).and_then(|()| self.accept(tree));
@@ -363,36 +362,26 @@ impl Integrator {
             self.move_guess_to_new_chart();
         }
         let s = count - 1;
+        self.missed.expected_into(&mut self.direction);
         for dof in 0..tree.dof() {
             for alpha in 1..=s {
                 let at = dof * s + alpha - 1;
                 self.extrapolated[at] = self.del.node(alpha, dof);
-                if self.known_missed > 0 {
-                    let trend =
-                        if self.follows_trend { self.missed[at] - self.missed_before[at] } else { 0.0 };
-                    self.del.move_node(alpha, dof, self.missed[at] + trend);
-                }
+                self.del.move_node(alpha, dof, self.direction[at]);
             }
         }
     }
 
-    /// Keeps what the extrapolation missed, and finds out whether to follow its trend: the order it gains is lost where inputs jump.
+    /// Learns from what the extrapolation has missed of the solution.
     fn remember_missed(&mut self, tree: &KinematicTree) {
         let s = self.del.unknown_nodes();
-        let (mut without, mut with) = (0.0f64, 0.0f64);
         for dof in 0..tree.dof() {
             for alpha in 1..=s {
                 let at = dof * s + alpha - 1;
-                let missed = self.del.node(alpha, dof) - self.extrapolated[at];
-                let change = missed - self.missed[at];
-                without = without.max(change.abs());
-                with = with.max((change - (self.missed[at] - self.missed_before[at])).abs());
-                self.missed_before[at] = self.missed[at];
-                self.missed[at] = missed;
+                self.extrapolated[at] = self.del.node(alpha, dof) - self.extrapolated[at];
             }
         }
-        self.follows_trend = self.known_missed == 2 && with < without;
-        self.known_missed = (self.known_missed + 1).min(2);
+        self.missed.remember(&mut self.extrapolated);
     }
 
     /// The guess of a floating base is in the chart of the last step: the same poses in the chart of this step.
@@ -465,7 +454,22 @@ impl Integrator {
         }
     }
 
+    /// Makes the Newton matrix at the present nodes, whose residual `direction` holds.
     fn factor(&mut self, tree: &KinematicTree, report: &mut StepReport) -> Result<(), FactorError> {
+        let s = self.del.unknown_nodes();
+        for (alpha, row) in self.del.held_rows.iter_mut().enumerate() {
+            *row = core::array::from_fn(|k| self.direction[k * s + alpha]);
+        }
+        let outcome = self.factor_or_fall_back(tree, report);
+        self.del.held_rows.fill([0.0; 6]);
+        outcome
+    }
+
+    fn factor_or_fall_back(
+        &mut self,
+        tree: &KinematicTree,
+        report: &mut StepReport,
+    ) -> Result<(), FactorError> {
         report.factorizations += 1;
         self.keep_factors();
         if !self.use_dense {
@@ -487,6 +491,7 @@ impl Integrator {
 
     fn keep_factors(&mut self) {
         self.factored = true;
+        self.broyden.forget();
         for (k, travel) in self.factored_travel.iter_mut().enumerate() {
             *travel = Vector3::from_fn(|r, _| self.del.node(k + 1, 3 + r));
         }
@@ -522,7 +527,7 @@ impl Integrator {
             *end = self.del.node(s, dof);
         }
         let (mut last_change, mut last_contraction) = (f64::INFINITY, 0.0f64);
-        self.broyden.forget();
+        self.broyden.begin();
         let mut contracts = self.factored;
         let (old_factors, mut renewed) = (self.factored, false);
         let factorizations = report.factorizations;
@@ -536,7 +541,6 @@ impl Integrator {
             }
             if self.options.variant == NewtonVariant::Exact || !contracts {
                 self.factor(tree, report)?;
-                self.broyden.forget();
                 renewed = true;
             }
             match (&mut self.dense, self.use_dense) {
@@ -579,18 +583,21 @@ impl Integrator {
             // Newton's method with the matrix of the guess: the second change is as the square of the first.
             let fresh = renewed && !limited && report.factorizations == factorizations + 1;
             if fresh && iteration == 1 {
-                self.quadratic = change / (last_change * last_change);
+                let ratio = change / (last_change * last_change);
+                self.quadratic = if change > CLEAN_CHANGE * size { ratio } else { self.quadratic.min(ratio) };
             }
             let predicted = SAFETY * self.quadratic * change * change;
             if change <= small * size
                 || (fresh && iteration == 0 && predicted <= self.options.accuracy * size)
                 || (iteration > 0 && change * rate <= self.options.accuracy * size)
+                || (old && last_change <= SMALL_CHANGE * size)
                 || (hidden && left <= self.options.accuracy * size)
                 || (!old && change < STAGNATION_CHANGE * size && contraction > 0.5)
             {
                 self.del.evaluate(tree, forces.laws);
+                self.broyden.end();
                 if !old_factors {
-                    if self.known_missed > 0 {
+                    if self.missed.is_known() {
                         self.new_factor_iterations = iteration + 1;
                     }
                 } else if renewed {
@@ -600,7 +607,8 @@ impl Integrator {
                 }
                 return Ok(());
             }
-            contracts = !limited && (contraction < RENEW_CONTRACTION || iteration == 0);
+            let round_off = if old { CLEAN_CHANGE * size } else { 0.0 };
+            contracts = !limited && (change - round_off < RENEW_CONTRACTION * last_change || iteration == 0);
             (last_change, last_contraction) = (change, contraction);
         }
         Err(StepError::NotConverged { residual, change: last_change, iterations: report.iterations })
