@@ -123,6 +123,8 @@ pub struct DelWorkspace {
     pub(crate) start: State,
     pub(crate) capacity: ForceCapacity,
     pub(crate) center: RigidTransform,
+    /// `(n; m)` of [`crate::floating_base`], α = 0..s-1: the base rows that the Newton matrix takes for a wrench held in {0}.
+    pub(crate) held_rows: Vec<[f64; 6]>,
     load_capacity: usize,
     projections: Vec<[Quad; 6]>,
     /// `(sin, cos)` of the joint coordinates at the start.
@@ -175,6 +177,7 @@ impl DelWorkspace {
             start: State::zeros(tree),
             center: RigidTransform::identity(),
             capacity,
+            held_rows: vec![[0.0; 6]; if tree.is_floating() { rule.unknown_nodes() } else { 0 }],
             load_capacity,
             projections: vec![[Quad::ZERO; 6]; groups],
             start_sin_cos: vec![(0.0, 1.0); tree.joint_count()],

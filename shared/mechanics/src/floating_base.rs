@@ -57,6 +57,20 @@
 //! test: N(X)ᵀ - N(X) = Sᵀ ad^D_X S  (Maurer-Cartan, as 6 x 6 matrices)
 //! ```
 //!
+//! # Newton's method
+//!
+//! The rows are components of a wrench along the axes of the chart, about its origin: `r = (n; m)`, `m = R_bᵀ f`,
+//! `n = R_bᵀ(τ - p_b×f)`. The chart moves with the unknowns `ξ^s`, by `δω` and, in its axes, by `δω×x^s + δx^s`; under a wrench `(τ, f)`
+//! held in {0} the rows change by
+//!
+//! ```text
+//! K(r) δξ^s = (n×δω + m×(δω×x^s + δx^s);  m×δω)                  K = [ n^ - m^x^   m^ ;  m^   0 ]
+//! ```
+//!
+//! That part of `J` is what is left of the residual; at the solution it is zero. With `J - K(r)` in the base columns of `ξ^s`, Newton's
+//! method solves for the wrench in {0}, where its equations are nearly linear: the second change falls to a fiftieth (from `10` to `0.2`
+//! times the square of the first, free-floating Atlas, s = 1). The unknown `x^α` has a like remedy in [`crate::step`].
+//!
 //! Limits: the rotation of one step must stay below a half turn each way (`|ω^s| <= π/2` is enforced); put {0} near the robot,
 //! because `P` is about the origin of {0} and its rounding error grows with the distance.
 //!

@@ -35,21 +35,22 @@ use crate::del_hessian::DelHessian;
 use crate::del_residual::DelWorkspace;
 use crate::errors::{ModelError, StepError};
 use crate::kinetic_hessian::KineticHessian;
-use crate::lanes::{Kernel, Quad, Simd, WIDE, WideLane};
-use crate::lobatto::MAX_UNKNOWN_NODES;
 use crate::mass_matrix_factor::MassMatrixFactor;
 use crate::newton_direction::{NewtonDirection, NewtonSolver};
 use crate::recursive_linearize::{AllColumns, ColumnSweeps};
 use crate::recursive_newton::RecursiveNewton;
 use crate::row_matrix::RowMatrix;
-use crate::spatial::{RigidTransform, Twist, Wrench};
 use crate::step::Integrator;
-use crate::tangent::{StartVariation, TangentWorkspace};
+use crate::tangent::TangentWorkspace;
 use crate::tree::KinematicTree;
 
+mod adjoint;
+mod end_blocks;
 mod end_rows;
+mod tangent_path;
 
-use end_rows::*;
+use end_blocks::EndBlocks;
+use end_rows::{EndRows, SolveMass, fill_right_hand_sides};
 
 /// Mean length of the branches above which the recursion over columns beats the matrix path, for s = 1, 2, 3 and more.
 ///
@@ -134,101 +135,6 @@ pub struct Linearizer {
     column: Vec<f64>,
     momentum: Vec<f64>,
     end: EndBlocks,
-}
-
-/// Row s of the Hessian, `H[s,γ]` for γ = 1..s, row by row: every coordinate with all that share a branch with it.
-#[derive(Clone, Debug)]
-struct EndBlocks {
-    related: Vec<u32>,
-    starts: Vec<usize>,
-    /// Where pair `(i, j)`, j on the branch of i, stands in row i and in row j.
-    places: Vec<[u32; 2]>,
-    /// `s` entries for every one of `related`.
-    entries: Vec<f64>,
-}
-
-impl EndBlocks {
-    /// Fixed base; empty for a floating one.
-    fn new(tree: &KinematicTree, s: usize) -> Self {
-        let n = if tree.is_floating() { 0 } else { tree.dof() };
-        let mut starts = vec![0; n + 1];
-        for i in 0..n {
-            for &j in tree.branch(i) {
-                starts[i + 1] += 1;
-                if j as usize != i {
-                    starts[j as usize + 1] += 1;
-                }
-            }
-        }
-        for i in 0..n {
-            starts[i + 1] += starts[i];
-        }
-        let mut next = starts.clone();
-        let mut related = vec![0; starts[n]];
-        let mut take = |row: usize, column: usize| {
-            let place = next[row];
-            related[place] = column as u32;
-            next[row] += 1;
-            place as u32
-        };
-        let mut places = Vec::new();
-        for i in 0..n {
-            for &j in tree.branch(i) {
-                let j = j as usize;
-                let own = take(i, j);
-                places.push([own, if i == j { own } else { take(j, i) }]);
-            }
-        }
-        Self { entries: vec![0.0; related.len() * s], related, starts, places }
-    }
-
-    /// Copies the entries; in velocity coordinates less `K_q̇q` of the end at γ = s.
-    fn fill(
-        &mut self,
-        tree: &KinematicTree,
-        hessian: &DelHessian,
-        kinetic: Option<&KineticHessian>,
-        s: usize,
-    ) {
-        // With constant arguments the loops over nodes unroll.
-        match s {
-            1 => self.fill_entries(tree, hessian, 1),
-            2 => self.fill_entries(tree, hessian, 2),
-            3 => self.fill_entries(tree, hessian, 3),
-            s => self.fill_entries(tree, hessian, s),
-        }
-        let Some(kinetic) = kinetic else { return };
-        for i in 0..self.starts.len() - 1 {
-            let first = hessian.pair_starts[i];
-            for position in 0..tree.branch(i).len() {
-                let [own, other] = self.places[first + position].map(|place| place as usize * s);
-                let terms = kinetic.pair(i, position);
-                if own != other {
-                    self.entries[other + s - 1] -= terms[2].0[1];
-                }
-                self.entries[own + s - 1] -= terms[1].0[1];
-            }
-        }
-    }
-
-    #[inline(always)]
-    fn fill_entries(&mut self, tree: &KinematicTree, hessian: &DelHessian, s: usize) {
-        for i in 0..self.starts.len() - 1 {
-            let pairs = hessian.pair_starts[i]..hessian.pair_starts[i + 1];
-            for (block, &places) in hessian.body_pairs(i, s).zip(&self.places[pairs]) {
-                let [own, other] = places.map(|place| place as usize * s);
-                let entries = &mut self.entries[other..other + s];
-                for gamma in 1..=s {
-                    entries[gamma - 1] = block.mirrored(s, gamma);
-                }
-                let entries = &mut self.entries[own..own + s];
-                for gamma in 1..=s {
-                    entries[gamma - 1] = block.entry(s, gamma);
-                }
-            }
-        }
-        debug_assert_eq!(tree.dof() + 1, self.starts.len());
-    }
 }
 
 impl Linearizer {
@@ -413,190 +319,5 @@ impl Linearizer {
             del.instructions.dispatch_wide(AllColumns { tree, del, hold: self.hold, responses, sweeps, out });
         }
         Ok(&self.step)
-    }
-
-    /// The strict O(n²) path: per column one Algorithm T, one solve, one Algorithm T. Fixed base in `(q, p)`, floating base in
-    /// `(ε, δq, δπ, δp_j)`.
-    ///
-    /// # Errors
-    /// [`StepError::Singular`] when the factorisation fails; [`ModelError::Unsupported`] for velocity coordinates.
-    pub fn linearize_by_tangent(
-        &mut self,
-        tree: &KinematicTree,
-        integrator: &mut Integrator,
-    ) -> Result<&LinearStep, StepError> {
-        if self.coordinates == StateCoordinates::Velocity {
-            let reason = "the tangent path gives momentum coordinates";
-            return Err(ModelError::Unsupported { body: 0, reason }.into());
-        }
-        let (del, solver) = integrator.factor_solution(tree)?;
-        let n = tree.dof();
-        for column in 0..self.step.matrix.columns() {
-            self.tangent_column(tree, del, solver, column, n);
-        }
-        Ok(&self.step)
-    }
-
-    fn tangent_column(
-        &mut self,
-        tree: &KinematicTree,
-        del: &DelWorkspace,
-        solver: &mut NewtonSolver,
-        column: usize,
-        n: usize,
-    ) {
-        let (s, base) = (self.s, tree.base_dof());
-        let start_pose = del.start.base_pose;
-        self.tangent.clear();
-        let mut start = StartVariation::default();
-        if column < base {
-            start.base_twist_w = start_pose.transform_twist(&unit_twist(column));
-            let momentum = del.start_momentum();
-            start.base_momentum_w = momentum.dual_bracket(&start.base_twist_w) * -0.5;
-        } else if column < n {
-            self.tangent.set(0, column, 1.0);
-        } else if column < n + base {
-            start.base_momentum_w = start_pose.transform_wrench(&unit_wrench(column - n));
-        }
-        self.tangent.set_start(start);
-        self.tangent.evaluate(tree, del);
-        self.tangent.residual_into(tree, del, &mut self.column);
-        if (n + base..2 * n).contains(&column) {
-            self.column[(column - n) * s] += 1.0;
-        }
-        let joints = tree.joint_count();
-        let input = (column >= 2 * n).then(|| {
-            let index = column - 2 * n;
-            (index % joints + base, index / joints)
-        });
-        let step = |alpha: usize| del.rule.weights()[alpha] * del.time_step;
-        if let Some((dof, node)) = input {
-            for alpha in 0..s {
-                if self.hold == InputHold::Held || alpha == node {
-                    self.column[dof * s + alpha] += step(alpha);
-                }
-            }
-        }
-        for x in &mut self.column {
-            *x = -*x;
-        }
-        solver.solve(tree, &mut self.column);
-        for dof in 0..n {
-            for gamma in 1..=s {
-                self.tangent.set(gamma, dof, self.column[dof * s + gamma - 1]);
-            }
-        }
-        self.tangent.evaluate(tree, del);
-        self.tangent.next_momentum_into(tree, del, &mut self.momentum);
-        if let Some((dof, node)) = input
-            && (self.hold == InputHold::Held || node == s)
-        {
-            self.momentum[dof] += step(s);
-        }
-        self.write_column(tree, del, column, n);
-    }
-
-    fn write_column(&mut self, tree: &KinematicTree, del: &DelWorkspace, column: usize, n: usize) {
-        let (s, base) = (self.s, tree.base_dof());
-        let out = &mut self.step.matrix;
-        if base > 0 {
-            let end_pose: RigidTransform = del.body_pose(0, s);
-            let eta = self.tangent.body_variation(0, s);
-            let change = Wrench::from_vector(&nalgebra::Vector6::from_column_slice(&self.momentum[..6]));
-            let (_, impulse) = del.body_momentum_and_impulse(0, s);
-            let momentum = del.base_momentum_before_end() + impulse;
-            let pose_error = end_pose.inverse_transform_twist(&eta).to_vector();
-            let momentum_error =
-                end_pose.inverse_transform_wrench(&(change + momentum.dual_bracket(&eta) * 0.5)).to_vector();
-            for k in 0..6 {
-                out.set(k, column, pose_error[k]);
-                out.set(n + k, column, momentum_error[k]);
-            }
-        }
-        for dof in base..n {
-            out.set(dof, column, self.column[dof * s + s - 1]);
-            out.set(n + dof, column, self.momentum[dof]);
-        }
-    }
-
-    /// Adjoint products `Aᵀλ` (2n) and `Bᵀλ` (inputs) in `(q, p)` around the step that `integrator` has just solved, by one
-    /// transposed solve: O(s² Σ depth) with a factorised Newton matrix. Fixed base. Use it for gradients instead of `A`, `B`.
-    ///
-    /// # Errors
-    /// [`StepError::Singular`] when the factorisation fails; [`ModelError`] for a floating base, velocity coordinates or wrong
-    /// lengths.
-    pub fn adjoint_into(
-        &mut self,
-        tree: &KinematicTree,
-        integrator: &mut Integrator,
-        lambda: &[f64],
-        a_lambda: &mut [f64],
-        b_lambda: &mut [f64],
-    ) -> Result<(), StepError> {
-        let (n, s) = (tree.dof(), self.s);
-        if tree.is_floating() || self.coordinates == StateCoordinates::Velocity {
-            let reason = "adjoint products are in (q, p) of a fixed base";
-            return Err(ModelError::Unsupported { body: 0, reason }.into());
-        }
-        for (quantity, got, expected) in [
-            ("lambda", lambda.len(), 2 * n),
-            ("a_lambda", a_lambda.len(), 2 * n),
-            ("b_lambda", b_lambda.len(), self.step.inputs()),
-        ] {
-            if got != expected {
-                return Err(ModelError::Length { quantity, got, expected }.into());
-            }
-        }
-        let (del, solver) = integrator.factor_solution(tree)?;
-        if solver.hessian().is_none() {
-            self.hessian.evaluate(tree, del);
-        }
-        let (lambda_q, lambda_p) = lambda.split_at(n);
-        let y = &mut self.column;
-        y.fill(0.0);
-        a_lambda.fill(0.0);
-        {
-            let hessian = solver.hessian().unwrap_or(&self.hessian);
-            for i in 0..n {
-                y[i * s + s - 1] += lambda_q[i];
-                for (position, &j) in tree.branch(i).iter().enumerate() {
-                    let (j, pair) = (j as usize, hessian.pair_starts[i] + position);
-                    for gamma in 1..=s {
-                        y[j * s + gamma - 1] += hessian.entry(pair, s, gamma) * lambda_p[i];
-                        if i != j {
-                            y[i * s + gamma - 1] += hessian.mirrored(pair, s, gamma) * lambda_p[j];
-                        }
-                    }
-                    a_lambda[j] += hessian.entry(pair, s, 0) * lambda_p[i];
-                    if i != j {
-                        a_lambda[i] += hessian.mirrored(pair, s, 0) * lambda_p[j];
-                    }
-                }
-            }
-        }
-        solver.solve_transposed(tree, y);
-        let hessian = solver.hessian().unwrap_or(&self.hessian);
-        let step = |alpha: usize| del.rule.weights()[alpha] * del.time_step;
-        b_lambda.fill(0.0);
-        for i in 0..n {
-            a_lambda[n + i] = -y[i * s];
-            for alpha in 0..=s {
-                let slot = match self.hold {
-                    InputHold::Held => i,
-                    InputHold::PerNode => alpha * n + i,
-                };
-                b_lambda[slot] += step(alpha) * if alpha < s { -y[i * s + alpha] } else { lambda_p[i] };
-            }
-            for (position, &j) in tree.branch(i).iter().enumerate() {
-                let (j, pair) = (j as usize, hessian.pair_starts[i] + position);
-                for alpha in 0..s {
-                    a_lambda[j] -= hessian.entry(pair, alpha, 0) * y[i * s + alpha];
-                    if i != j {
-                        a_lambda[i] -= hessian.mirrored(pair, alpha, 0) * y[j * s + alpha];
-                    }
-                }
-            }
-        }
-        Ok(())
     }
 }

@@ -8,15 +8,15 @@
 //! | `θ` | contraction: size of a change relative to the one before |
 //!
 //! **Start.** The interpolation polynomial of the step before is extrapolated, `q^α := Σ_β l_β(1 + c_α) q_prev^β`, when the step
-//! continues where the last one ended (a floating base: in the chart of the last step, then moved to the new one). What the last
-//! extrapolation missed is added: it changes little from step to step, so that the guess gains an order; and where it has changed
-//! steadily, its trend, for another order. Else
-//! `q^α = q^0 + c_α Δt M⁻¹p`; if Newton fails from there, `q^α = q^0`.
+//! continues where the last one ended (a floating base: in the chart of the last step, then moved to the new one). What that is
+//! expected to miss, going by the last steps (`missed.rs`), is added. Else `q^α = q^0 + c_α Δt M⁻¹p`; if Newton fails from there,
+//! `q^α = q^0`.
 //!
 //! **Iteration.** `J` is factorised once and kept while the iteration contracts (simplified Newton), also over the steps that
 //! continue the motion and after a linearisation: it changes by `O(Δt)` from step to step, and a factorisation costs as much as
 //! two or three iterations. When old factors take more iterations than new ones are worth, the next step makes new ones; when
-//! they do not contract (light links at high accelerations), the next sixteen do. Broyden's update on top of the factors costs a few scalar products and saves about one iteration. `J`
+//! they do not contract (light links at high accelerations), the next sixteen do. Broyden's update on top of the factors, and what the
+//! step before tells about them ([`crate::broyden`]), cost a few scalar products and save one or two iterations. `J`
 //! is renewed when `θ` exceeds 0.1. A change may be limited to [`StepOptions::change_limit`] in the largest angle, a trust region
 //! without a merit function: on a 32-link chain at steps of 40 ms (trapezoidal, random states, `tests/paper`) it raises the share of
 //! solved steps from 0.5 to 0.9.
@@ -25,7 +25,8 @@
 //! when the next change is predicted below [`StepOptions::accuracy`] times `1 + max|q|`, by default 1e-16: what is left of it accumulates in the momenta over many steps
 //! (stopping at 1e-14 left 1e-10 in an exactly conserved momentum after 500 steps). With old factors the prediction is linear in the
 //! change, and when round-off hides a contraction, those before it count; with the factors of the guess the second change is as the square of the first, and their ratio in an earlier step, times ten
-//! for safety, may end the iteration at the first. Or when the change is below `1e-8` and no longer shrinks: round-off.
+//! for safety, may end the iteration at the first. Or when the change is below `1e-8` and no longer shrinks: round-off. With old factors
+//! a change of 1e-14 is the last but one, and none below 1e-13 says that they do not contract.
 //!
 //! Source: the paper, section 3.2 (there `δq = -J r`; the inverse is missing in print); Broyden's method in the form of
 //! C. T. Kelley, *Iterative Methods for Linear and Nonlinear Equations*, SIAM 1995, section 7.3.
@@ -35,93 +36,25 @@ use alloc::vec::Vec;
 use nalgebra::Vector3;
 
 use crate::broyden::Broyden;
-use crate::del_residual::{DelWorkspace, ForceCapacity};
+use crate::del_residual::DelWorkspace;
 use crate::dense_lu::DenseNewton;
 use crate::errors::{FactorError, ModelError, StepError};
-use crate::floating_base::MAX_HALF_ROTATION;
 use crate::forces::StepForces;
 use crate::lobatto::LobattoRule;
 use crate::newton_direction::{NewtonDirection, NewtonMethod, NewtonSolver};
-use crate::real::sqrt;
-use crate::spatial::{RigidTransform, exp_rotation, log_rotation};
+use crate::spatial::RigidTransform;
 use crate::state::State;
-use crate::tree::{JointKind, KinematicTree};
+use crate::tree::KinematicTree;
 use crate::velocity::VelocityWorkspace;
 
-/// A change below this (times `1 + max|q|`) is converged without prediction.
-const SMALL_CHANGE: f64 = 1e-14;
-/// Below this the iteration may stop when it no longer shrinks: round-off.
-const STAGNATION_CHANGE: f64 = 1e-8;
-/// Contraction above which the Newton matrix is renewed.
-const RENEW_CONTRACTION: f64 = 0.1;
-/// Iterations that cost as much as a factorisation: the factors of an earlier step may take this many more than new ones.
-const FACTOR_ITERATIONS: usize = 2;
-/// When they do not contract, this many steps begin with new factors before old ones are tried again; when they only take more
-/// iterations, one.
-const REUSE_PAUSE: u32 = 16;
-/// The ratio of the last step may have grown by this much when it predicts the second change of this one.
-const SAFETY: f64 = 10.0;
+mod guess;
+mod iteration;
+mod missed;
+mod options;
 
-/// How the Newton matrix is used from one iteration to the next.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum NewtonVariant {
-    /// Factorised anew in every iteration.
-    Exact,
-    /// Factorised once, renewed when the contraction is poor.
-    Simplified,
-    /// As `Simplified`, with Broyden's rank-one updates.
-    Broyden,
-}
+use missed::Missed;
 
-/// What is fixed when an [`Integrator`] is made.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct StepOptions {
-    /// Factorisation; `None` takes [`NewtonMethod::fastest`].
-    pub method: Option<NewtonMethod>,
-    /// Use of the Newton matrix.
-    pub variant: NewtonVariant,
-    /// Iterations after which the step fails.
-    pub max_iterations: usize,
-    /// The iteration ends when the next change of a coordinate is predicted below this, times `1 + max|q|`. At 1e-16, the default,
-    /// invariants hold over many steps; a prediction over a few steps needs less.
-    pub accuracy: f64,
-    /// A revolute joint may end a step this far (rad) from where the guess put it; solutions beyond are refused as spurious.
-    pub turn_limit: f64,
-    /// Largest change of a revolute joint in one iteration (rad): a longer change is shortened as a whole; infinite (the default): no
-    /// limit. Without effect while changes are small. 0.3 helps long chains at steps so long that `J` is nearly singular on the way;
-    /// a tree whose way to the root is longer than that may need more iterations with it than without.
-    pub change_limit: f64,
-    /// Room for forces outside the model.
-    pub forces: ForceCapacity,
-    /// Coordinates times nodes up to which a dense LU stands by for states where a leaf-to-root pivot is singular.
-    pub dense_fallback: usize,
-}
-
-impl Default for StepOptions {
-    fn default() -> Self {
-        Self {
-            method: None,
-            variant: NewtonVariant::Broyden,
-            max_iterations: 40,
-            accuracy: 1e-16,
-            turn_limit: 1.0,
-            change_limit: f64::INFINITY,
-            forces: ForceCapacity::default(),
-            dense_fallback: 128,
-        }
-    }
-}
-
-/// What a step took.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct StepReport {
-    /// Newton iterations (residual evaluations with a solve).
-    pub iterations: usize,
-    /// Factorisations of the Newton matrix.
-    pub factorizations: usize,
-    /// Largest absolute entry of the last change.
-    pub last_change: f64,
-}
+pub use options::{NewtonVariant, StepOptions, StepReport};
 
 /// The variational integrator of one tree, rule and time step, with all its memory.
 ///
@@ -163,14 +96,9 @@ pub struct Integrator {
     /// Chart centre of a floating base in the last step.
     previous_center: RigidTransform,
     has_previous: bool,
-    /// Nodes as extrapolated, and what the last extrapolation missed: `dof * s + α - 1`.
+    /// Nodes as extrapolated, `dof * s + α - 1`, and what that missed.
     extrapolated: Vec<f64>,
-    missed: Vec<f64>,
-    /// What the extrapolation before that missed.
-    missed_before: Vec<f64>,
-    /// How many of the two are known, and whether their trend told the last one better than the one before it.
-    known_missed: usize,
-    follows_trend: bool,
+    missed: Missed,
     /// The solver holds the factors of a Newton matrix of this motion.
     factored: bool,
     /// Iterations of the last step with new factors and a full guess; zero before the first one.
@@ -224,10 +152,7 @@ impl Integrator {
             previous_center: RigidTransform::identity(),
             has_previous: false,
             extrapolated: vec![0.0; order],
-            missed: vec![0.0; order],
-            missed_before: vec![0.0; order],
-            known_missed: 0,
-            follows_trend: false,
+            missed: Missed::new(order),
             factored: false,
             new_factor_iterations: 0,
             reuse_pause: 0,
@@ -281,7 +206,7 @@ impl Integrator {
                 return self.keep(tree, report);
             }
         }
-        self.known_missed = 0;
+        self.missed.forget();
         self.factored = false;
         self.guess_by_velocity(tree, state)?;
         let mut outcome = self.newton(tree, forces, &mut report).and_then(|()| self.accept(tree));
@@ -347,312 +272,6 @@ impl Integrator {
     /// Velocities, momenta and energies of states.
     pub fn velocities(&mut self) -> &mut VelocityWorkspace {
         &mut self.velocities
-    }
-
-    fn guess_by_extrapolation(&mut self, tree: &KinematicTree) {
-        let count = self.del.unknown_nodes() + 1;
-        for dof in 0..tree.dof() {
-            let nodes = &self.previous_nodes[dof * count..(dof + 1) * count];
-            for alpha in 1..count {
-                let row = &self.extrapolation[alpha * count..(alpha + 1) * count];
-                let value = row.iter().zip(nodes).map(|(l, q)| l * q).sum();
-                self.del.set_node(alpha, dof, value);
-            }
-        }
-        if tree.is_floating() {
-            self.move_guess_to_new_chart();
-        }
-        let s = count - 1;
-        for dof in 0..tree.dof() {
-            for alpha in 1..=s {
-                let at = dof * s + alpha - 1;
-                self.extrapolated[at] = self.del.node(alpha, dof);
-                if self.known_missed > 0 {
-                    let trend =
-                        if self.follows_trend { self.missed[at] - self.missed_before[at] } else { 0.0 };
-                    self.del.move_node(alpha, dof, self.missed[at] + trend);
-                }
-            }
-        }
-    }
-
-    /// Keeps what the extrapolation missed, and finds out whether to follow its trend: the order it gains is lost where inputs jump.
-    fn remember_missed(&mut self, tree: &KinematicTree) {
-        let s = self.del.unknown_nodes();
-        let (mut without, mut with) = (0.0f64, 0.0f64);
-        for dof in 0..tree.dof() {
-            for alpha in 1..=s {
-                let at = dof * s + alpha - 1;
-                let missed = self.del.node(alpha, dof) - self.extrapolated[at];
-                let change = missed - self.missed[at];
-                without = without.max(change.abs());
-                with = with.max((change - (self.missed[at] - self.missed_before[at])).abs());
-                self.missed_before[at] = self.missed[at];
-                self.missed[at] = missed;
-            }
-        }
-        self.follows_trend = self.known_missed == 2 && with < without;
-        self.known_missed = (self.known_missed + 1).min(2);
-    }
-
-    /// The guess of a floating base is in the chart of the last step: the same poses in the chart of this step.
-    fn move_guess_to_new_chart(&mut self) {
-        let s = self.del.unknown_nodes();
-        let start = self.del.start.base_pose;
-        let vector = |del: &DelWorkspace, alpha: usize, at: usize| {
-            Vector3::new(del.node(alpha, at), del.node(alpha, at + 1), del.node(alpha, at + 2))
-        };
-        let pose = |del: &DelWorkspace, alpha: usize| {
-            let motion = RigidTransform {
-                rotation: exp_rotation(&vector(del, alpha, 0)),
-                translation: vector(del, alpha, 3),
-            };
-            self.previous_center * motion
-        };
-        let end = pose(&self.del, s);
-        let turn = log_rotation(&start.rotation.tr_mul(&end.rotation)) * 0.5;
-        let center = RigidTransform {
-            rotation: start.rotation * exp_rotation(&turn),
-            translation: (start.translation + end.translation) * 0.5,
-        };
-        for alpha in 1..=s {
-            let motion = center.inverse() * pose(&self.del, alpha);
-            let omega = log_rotation(&motion.rotation);
-            for k in 0..3 {
-                self.del.set_node(alpha, k, omega[k]);
-                self.del.set_node(alpha, 3 + k, motion.translation[k]);
-            }
-        }
-    }
-
-    fn guess_by_velocity(&mut self, tree: &KinematicTree, state: &State) -> Result<(), StepError> {
-        self.velocities.velocity_into(tree, state, &mut self.rate)?;
-        let step = self.del.time_step();
-        for alpha in 1..=self.del.unknown_nodes() {
-            let c = self.del.rule().nodes()[alpha];
-            for joint in 0..tree.joint_count() {
-                let dof = tree.base_dof() + joint;
-                self.del.set_node(alpha, dof, state.q[joint] + c * step * self.rate[dof]);
-            }
-            if tree.is_floating() {
-                let half = self.half_motion(state);
-                for (k, value) in half.iter().enumerate() {
-                    self.del.set_node(alpha, k, (2.0 * c - 1.0) * value);
-                }
-            }
-        }
-        Ok(())
-    }
-
-    /// Half a step of the base at constant body velocity, in the chart centred in the middle of the step.
-    fn half_motion(&self, state: &State) -> [f64; 6] {
-        let vector = |at: usize| Vector3::new(self.rate[at], self.rate[at + 1], self.rate[at + 2]);
-        let (omega, linear) = (vector(0), vector(3));
-        let pose = &state.base_pose;
-        let half = 0.5 * self.del.time_step();
-        let turn = pose.rotation.tr_mul(&omega) * half;
-        let center = pose.rotation * exp_rotation(&turn);
-        let travel = center.tr_mul(&(linear + omega.cross(&pose.translation))) * half;
-        [turn.x, turn.y, turn.z, travel.x, travel.y, travel.z]
-    }
-
-    fn guess_at_rest(&mut self, tree: &KinematicTree) {
-        for alpha in 1..=self.del.unknown_nodes() {
-            for dof in 0..tree.dof() {
-                let value = if dof < tree.base_dof() { 0.0 } else { self.del.node(0, dof) };
-                self.del.set_node(alpha, dof, value);
-            }
-        }
-    }
-
-    fn factor(&mut self, tree: &KinematicTree, report: &mut StepReport) -> Result<(), FactorError> {
-        report.factorizations += 1;
-        self.keep_factors();
-        if !self.use_dense {
-            let outcome = self.solver.factor(tree, &self.del);
-            self.factored = outcome.is_ok();
-            match (outcome, &self.dense) {
-                (Ok(()), _) => return Ok(()),
-                (Err(error), None) => return Err(error),
-                // The leaf-to-root pivots fail where pivoting over the whole matrix need not.
-                (Err(_), Some(_)) => self.use_dense = true,
-            }
-        }
-        self.factored = false;
-        match &mut self.dense {
-            Some(dense) => dense.factor(tree, &self.del),
-            None => self.solver.factor(tree, &self.del),
-        }
-    }
-
-    fn keep_factors(&mut self) {
-        self.factored = true;
-        for (k, travel) in self.factored_travel.iter_mut().enumerate() {
-            *travel = Vector3::from_fn(|r, _| self.del.node(k + 1, 3 + r));
-        }
-    }
-
-    /// Takes the change of a floating base for one of `R_b x`, at the `x` where `J` was made, instead of `x`.
-    ///
-    /// The axes of `x` turn with the unknown `ω^s`. The momentum of the whole robot goes with `R_b ẋ`, the light base turns under it:
-    /// in `x`, what a step or an iteration adds to the velocity changes `J` by a hundred times more than in `R_b x`. To first order
-    /// in the turn `δω^s`: `δx += δω^s × (x_J - x - δx)`.
-    fn turn_travel_with_chart(&mut self) {
-        let s = self.del.unknown_nodes();
-        let direction = &mut self.direction;
-        let turn = Vector3::from_fn(|k, _| direction[k * s + s - 1]);
-        for (alpha, factored) in self.factored_travel.iter().enumerate() {
-            let travel =
-                Vector3::from_fn(|k, _| self.del.node(alpha + 1, 3 + k) + direction[(3 + k) * s + alpha]);
-            let bend = turn.cross(&(factored - travel));
-            for k in 0..3 {
-                direction[(3 + k) * s + alpha] += bend[k];
-            }
-        }
-    }
-
-    fn newton(
-        &mut self,
-        tree: &KinematicTree,
-        forces: &StepForces<'_>,
-        report: &mut StepReport,
-    ) -> Result<(), StepError> {
-        let s = self.del.unknown_nodes();
-        for (dof, end) in self.guessed_end.iter_mut().enumerate() {
-            *end = self.del.node(s, dof);
-        }
-        let (mut last_change, mut last_contraction) = (f64::INFINITY, 0.0f64);
-        self.broyden.forget();
-        let mut contracts = self.factored;
-        let (old_factors, mut renewed) = (self.factored, false);
-        let factorizations = report.factorizations;
-        let mut residual = f64::INFINITY;
-        for iteration in 0..self.options.max_iterations {
-            self.del.evaluate(tree, forces.laws);
-            self.del.residual_into(tree, &mut self.direction);
-            residual = self.direction.iter().fold(0.0f64, |m, x| m.max(x.abs()));
-            if let Some(index) = self.direction.iter().position(|x| !x.is_finite()) {
-                return Err(StepError::NonFinite { quantity: "DEL residual (coordinate * s + node)", index });
-            }
-            if self.options.variant == NewtonVariant::Exact || !contracts {
-                self.factor(tree, report)?;
-                self.broyden.forget();
-                renewed = true;
-            }
-            match (&mut self.dense, self.use_dense) {
-                (Some(dense), true) => dense.solve(tree, &mut self.direction),
-                _ => self.solver.solve(tree, &mut self.direction),
-            }
-            for x in &mut self.direction {
-                *x = -*x;
-            }
-            if self.options.variant == NewtonVariant::Broyden {
-                self.broyden.improve(&mut self.direction);
-            }
-            if tree.is_floating() {
-                self.turn_travel_with_chart();
-            }
-            report.iterations += 1;
-            let limited = self.limit_change(tree);
-            let mut size = 1.0f64;
-            let mut change = 0.0f64;
-            for dof in 0..tree.dof() {
-                for alpha in 1..=s {
-                    let delta = self.direction[dof * s + alpha - 1];
-                    self.del.move_node(alpha, dof, delta);
-                    size = size.max(1.0 + self.del.node(alpha, dof).abs());
-                    change = change.max(delta.abs());
-                }
-            }
-            report.last_change = change;
-            if !change.is_finite() {
-                return Err(StepError::NotConverged { residual, change, iterations: report.iterations });
-            }
-            let contraction = change / last_change;
-            // Old factors contract unevenly: the worse of two contractions counts, and a poor one is no sign of round-off.
-            let old = old_factors && !renewed;
-            let rate = if old { contraction.max(last_contraction) } else { contraction };
-            // What is left by the contractions before this one, should round-off hide how much this change is smaller than the last.
-            let left = last_change * last_contraction * last_contraction;
-            let hidden = old && iteration > 1 && change < STAGNATION_CHANGE * size;
-            let small = if old { self.options.accuracy } else { SMALL_CHANGE.max(self.options.accuracy) };
-            // Newton's method with the matrix of the guess: the second change is as the square of the first.
-            let fresh = renewed && !limited && report.factorizations == factorizations + 1;
-            if fresh && iteration == 1 {
-                self.quadratic = change / (last_change * last_change);
-            }
-            let predicted = SAFETY * self.quadratic * change * change;
-            if change <= small * size
-                || (fresh && iteration == 0 && predicted <= self.options.accuracy * size)
-                || (iteration > 0 && change * rate <= self.options.accuracy * size)
-                || (hidden && left <= self.options.accuracy * size)
-                || (!old && change < STAGNATION_CHANGE * size && contraction > 0.5)
-            {
-                self.del.evaluate(tree, forces.laws);
-                if !old_factors {
-                    if self.known_missed > 0 {
-                        self.new_factor_iterations = iteration + 1;
-                    }
-                } else if renewed {
-                    self.reuse_pause = REUSE_PAUSE;
-                } else if iteration + 1 > self.new_factor_iterations + FACTOR_ITERATIONS {
-                    self.reuse_pause = 1;
-                }
-                return Ok(());
-            }
-            contracts = !limited && (contraction < RENEW_CONTRACTION || iteration == 0);
-            (last_change, last_contraction) = (change, contraction);
-        }
-        Err(StepError::NotConverged { residual, change: last_change, iterations: report.iterations })
-    }
-
-    /// Shortens a change that turns a joint by more than the limit.
-    fn limit_change(&mut self, tree: &KinematicTree) -> bool {
-        if self.options.change_limit.is_infinite() {
-            return false;
-        }
-        let s = self.del.unknown_nodes();
-        let mut turn = 0.0f64;
-        for (body, spec) in tree.bodies().iter().enumerate().skip(tree.first_joint_body()) {
-            if spec.joint.kind == JointKind::Revolute {
-                let dof = tree.joint_dof(body);
-                for delta in &self.direction[dof * s..(dof + 1) * s] {
-                    turn = turn.max(delta.abs());
-                }
-            }
-        }
-        let limited = turn > self.options.change_limit;
-        if limited {
-            let scale = self.options.change_limit / turn;
-            for x in &mut self.direction {
-                *x *= scale;
-            }
-        }
-        limited
-    }
-
-    /// Refuses solutions that are not the continuation of the motion.
-    fn accept(&self, tree: &KinematicTree) -> Result<(), StepError> {
-        let s = self.del.unknown_nodes();
-        if tree.is_floating() {
-            let half = sqrt((0..3).map(|k| self.del.node(s, k) * self.del.node(s, k)).sum());
-            if half > MAX_HALF_ROTATION {
-                let limit = 2.0 * MAX_HALF_ROTATION;
-                return Err(StepError::SpuriousSolution { dof: 0, change: 2.0 * half, limit });
-            }
-        }
-        for (body, spec) in tree.bodies().iter().enumerate().skip(tree.first_joint_body()) {
-            if spec.joint.kind != JointKind::Revolute {
-                continue;
-            }
-            let dof = tree.joint_dof(body);
-            let change = (self.del.node(s, dof) - self.guessed_end[dof]).abs();
-            let limit = self.options.turn_limit;
-            if change > limit {
-                return Err(StepError::SpuriousSolution { dof, change, limit });
-            }
-        }
-        Ok(())
     }
 
     fn keep(&mut self, tree: &KinematicTree, report: StepReport) -> Result<StepReport, StepError> {

@@ -2,15 +2,16 @@
 //!
 //! Letters and equations: [`super`].
 
-use super::*;
-
-pub(super) fn unit_twist(k: usize) -> Twist {
-    Twist::from_vector(&nalgebra::Vector6::ith(k, 1.0))
-}
-
-pub(super) fn unit_wrench(k: usize) -> Wrench {
-    Wrench::from_vector(&nalgebra::Vector6::ith(k, 1.0))
-}
+use super::InputHold;
+use super::end_blocks::EndBlocks;
+use crate::del_hessian::DelHessian;
+use crate::del_residual::DelWorkspace;
+use crate::kinetic_hessian::KineticHessian;
+use crate::lanes::{Kernel, Quad, Simd, WIDE, WideLane};
+use crate::lobatto::MAX_UNKNOWN_NODES;
+use crate::mass_matrix_factor::MassMatrixFactor;
+use crate::row_matrix::RowMatrix;
+use crate::tree::KinematicTree;
 
 pub(super) fn fill_right_hand_sides(
     tree: &KinematicTree,

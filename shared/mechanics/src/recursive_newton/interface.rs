@@ -1,0 +1,49 @@
+//! Where the blocks of the interface vectors `ζ` and `y` of Algorithm B.1 stand.
+
+use crate::lobatto::MAX_UNKNOWN_NODES;
+
+pub(crate) const MAX_NODES: usize = MAX_UNKNOWN_NODES + 1;
+
+/// Where the blocks of the interface vectors are.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Interface {
+    pub s: usize,
+    /// Rows of one `η` block: 3, or 6 with general wrenches.
+    pub eta: usize,
+    /// First node with a `DΓ` block: 1, or 0 with general wrenches.
+    pub first_impulse: usize,
+    /// Also `η^0` and `DΓ^s`, which the linearisation needs ([`crate::recursive_linearize`]); not with general wrenches.
+    pub whole_step: bool,
+}
+
+impl Interface {
+    /// First node with an `η` block.
+    #[inline(always)]
+    fn first_eta(&self) -> usize {
+        usize::from(!self.whole_step)
+    }
+    #[inline(always)]
+    pub fn inputs(&self) -> usize {
+        self.eta * (self.s - self.first_eta()) + 6 * (self.s + 1)
+    }
+    #[inline(always)]
+    pub fn outputs(&self) -> usize {
+        6 * (self.s + 1) + 6 * (self.s + usize::from(self.whole_step) - self.first_impulse)
+    }
+    #[inline(always)]
+    pub fn eta_at(&self, gamma: usize) -> usize {
+        self.eta * (gamma - self.first_eta())
+    }
+    #[inline(always)]
+    pub fn nu_at(&self, beta: usize) -> usize {
+        self.eta * (self.s - self.first_eta()) + 6 * beta
+    }
+    #[inline(always)]
+    pub fn momentum_at(&self, beta: usize) -> usize {
+        6 * beta
+    }
+    #[inline(always)]
+    pub fn impulse_at(&self, alpha: usize) -> usize {
+        6 * (self.s + 1) + 6 * (alpha - self.first_impulse)
+    }
+}
