@@ -655,9 +655,21 @@ impl Integrator {
         Ok(())
     }
 
+    /// `p^1 := row s + Σ_{α<s} r^α`. The columns of `a^{αβ}` sum to zero over all rows: this is `p^0` plus all impulses, without
+    /// the `a^{sβ} Sᵀμ ~ M δq/Δt` that an error `δq` of the nodes leaves in row s. (The base's momentum is such a sum already.)
+    fn add_residual_to_momentum(&mut self, tree: &KinematicTree) {
+        let s = self.del.unknown_nodes();
+        self.del.residual_into(tree, &mut self.direction);
+        let rows = self.direction.chunks_exact(s).skip(tree.base_dof());
+        for (p, row) in self.next.p[tree.base_dof()..].iter_mut().zip(rows) {
+            *p += row.iter().sum::<f64>();
+        }
+    }
+
     fn keep(&mut self, tree: &KinematicTree, report: StepReport) -> Result<StepReport, StepError> {
         let count = self.del.unknown_nodes() + 1;
         self.del.next_state_into(tree, &mut self.next);
+        self.add_residual_to_momentum(tree);
         for dof in 0..tree.dof() {
             for alpha in 0..count {
                 self.previous_nodes[dof * count + alpha] = self.del.node(alpha, dof);
