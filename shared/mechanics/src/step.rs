@@ -27,6 +27,9 @@
 //! change, and when round-off hides a contraction, those before it count; with the factors of the guess the second change is as the square of the first, and their ratio in an earlier step, times ten
 //! for safety, may end the iteration at the first. Or when the change is below `1e-8` and no longer shrinks: round-off.
 //!
+//! **End.** `p^1` is row s plus what is left of the residual, which is `p^0` plus all impulses: an error `δq` of the nodes reaches it as
+//! `Δt δq` instead of `δq/Δt`.
+//!
 //! Source: the paper, section 3.2 (there `δq = -J r`; the inverse is missing in print); Broyden's method in the form of
 //! C. T. Kelley, *Iterative Methods for Linear and Nonlinear Equations*, SIAM 1995, section 7.3.
 
