@@ -110,7 +110,7 @@ const INK: RGBColor = RGBColor(23, 32, 43);
 const GRID: RGBColor = RGBColor(222, 227, 233);
 const FONT: &str = "sans-serif";
 /// Units of the room for a legend beside the axes.
-const LEGEND_WIDTH: f64 = 190.0;
+const LEGEND_WIDTH: f64 = 218.0;
 /// Pixels of a panel in the PNG; the SVG has half as many units.
 const PANEL: (u32, u32) = (1180, 900);
 
@@ -238,7 +238,7 @@ fn draw_panel<B: DrawingBackend>(
             let colour = PALETTE[line.colour % PALETTE.len()];
             let (left, right, dot) = legend_parts(line.style, colour, zoom);
             beside.draw(&(EmptyElement::at(at) + left + right + dot))?;
-            beside.draw(&Text::new(line.title.clone(), (at.0 + px(34.0), at.1 - px(9.0)), style(14.5)))?;
+            beside.draw(&Text::new(line.title.clone(), (at.0 + px(34.0), at.1 - px(4.0)), style(14.5)))?;
         }
     } else {
         chart
