@@ -66,6 +66,7 @@ pub mod errors;
 pub mod floating_base;
 pub mod forces;
 pub mod gravity_hessian;
+pub(crate) mod inertial_newton;
 pub mod inverse_dynamics;
 pub mod kinematics;
 pub mod kinetic_hessian;

@@ -28,6 +28,9 @@
 //! for safety, may end the iteration at the first. Or when the change is below `1e-8` and no longer shrinks: round-off. With old factors
 //! a change of 1e-14 is the last but one, and none below 1e-13 says that they do not contract.
 //!
+//! **End.** `p^1` is row s plus what is left of the residual, which is `p^0` plus all impulses: an error `δq` of the nodes reaches it as
+//! `Δt δq` instead of `δq/Δt`.
+//!
 //! Source: the paper, section 3.2 (there `δq = -J r`; the inverse is missing in print); Broyden's method in the form of
 //! C. T. Kelley, *Iterative Methods for Linear and Nonlinear Equations*, SIAM 1995, section 7.3.
 
@@ -40,6 +43,7 @@ use crate::del_residual::DelWorkspace;
 use crate::dense_lu::DenseNewton;
 use crate::errors::{FactorError, ModelError, StepError};
 use crate::forces::StepForces;
+use crate::inertial_newton::InertialNewton;
 use crate::lobatto::LobattoRule;
 use crate::newton_direction::{NewtonDirection, NewtonMethod, NewtonSolver};
 use crate::spatial::RigidTransform;
@@ -83,6 +87,8 @@ pub struct Integrator {
     solver: NewtonSolver,
     dense: Option<DenseNewton>,
     use_dense: bool,
+    inertial: Option<InertialNewton>,
+    use_inertial: bool,
     velocities: VelocityWorkspace,
     options: StepOptions,
     direction: Vec<f64>,
@@ -141,6 +147,10 @@ impl Integrator {
             solver: NewtonSolver::new(method, tree, &del),
             dense,
             use_dense: false,
+            inertial: (options.variant == NewtonVariant::Inertial && !tree.is_floating())
+                .then(|| InertialNewton::new(rule, tree.dof(), del.instructions))
+                .flatten(),
+            use_inertial: false,
             velocities: VelocityWorkspace::new(tree),
             options,
             direction: vec![0.0; order],
@@ -195,8 +205,9 @@ impl Integrator {
         let continues = self.has_previous && *state == self.previous_end;
         self.has_previous = false;
         let mut report = StepReport::default();
+        self.use_inertial = self.inertial.is_some();
         if continues {
-            if self.reuse_pause > 0 || self.new_factor_iterations == 0 {
+            if self.use_inertial || self.reuse_pause > 0 || self.new_factor_iterations == 0 {
                 self.reuse_pause = self.reuse_pause.saturating_sub(1);
                 self.factored = false;
             }
@@ -274,9 +285,21 @@ impl Integrator {
         &mut self.velocities
     }
 
+    /// `p^1 := row s + Σ_{α<s} r^α`. The columns of `a^{αβ}` sum to zero over all rows: this is `p^0` plus all impulses, without
+    /// the `a^{sβ} Sᵀμ ~ M δq/Δt` that an error `δq` of the nodes leaves in row s. (The base's momentum is such a sum already.)
+    fn add_residual_to_momentum(&mut self, tree: &KinematicTree) {
+        let s = self.del.unknown_nodes();
+        self.del.residual_into(tree, &mut self.direction);
+        let rows = self.direction.chunks_exact(s).skip(tree.base_dof());
+        for (p, row) in self.next.p[tree.base_dof()..].iter_mut().zip(rows) {
+            *p += row.iter().sum::<f64>();
+        }
+    }
+
     fn keep(&mut self, tree: &KinematicTree, report: StepReport) -> Result<StepReport, StepError> {
         let count = self.del.unknown_nodes() + 1;
         self.del.next_state_into(tree, &mut self.next);
+        self.add_residual_to_momentum(tree);
         for dof in 0..tree.dof() {
             for alpha in 0..count {
                 self.previous_nodes[dof * count + alpha] = self.del.node(alpha, dof);

@@ -100,7 +100,12 @@ fn warm_steps_solves_and_velocities_take_no_memory() {
             force_w: Vector3::new(1.0, 0.0, 2.0),
         }];
         for method in METHODS {
-            for variant in [NewtonVariant::Exact, NewtonVariant::Simplified, NewtonVariant::Broyden] {
+            for variant in [
+                NewtonVariant::Exact,
+                NewtonVariant::Simplified,
+                NewtonVariant::Broyden,
+                NewtonVariant::Inertial,
+            ] {
                 for s in [1, 2, 3, 4] {
                     let name = format!("{} joints, {method:?}, {variant:?}, s = {s}", tree.joint_count());
                     let nodes = spread(tree.joint_count() * (s + 1), 0.3);

@@ -15,6 +15,7 @@ fn solved_steps_and_trajectories_match_the_vectors() {
         (NewtonMethod::BranchLu, NewtonVariant::Exact),
         (NewtonMethod::BranchLu, NewtonVariant::Simplified),
         (NewtonMethod::BranchLu, NewtonVariant::Broyden),
+        (NewtonMethod::BranchLu, NewtonVariant::Inertial),
         (NewtonMethod::Recursive, NewtonVariant::Exact),
         (NewtonMethod::Recursive, NewtonVariant::Broyden),
     ];

@@ -11,7 +11,7 @@ use delmpc_mechanics::prelude::*;
 use serde_json::json;
 
 use crate::pendulum::{Uniform, initial_conditions};
-use crate::plot::{Figure, Line, Panel, Scale, Style};
+use crate::plot::{Figure, Legend, Line, Panel, Scale, Style};
 use crate::results::{Claim, Part, Table, number};
 use crate::stopwatch::exponent;
 use crate::trajectory::distance;
@@ -140,7 +140,7 @@ pub fn run(campaign: &Campaign) -> Result<Part, Failure> {
         x_range: None,
         y_range: None,
         lines,
-        legend: true,
+        legend: Legend::Corner,
     };
     let figure = Figure {
         columns: 2,

@@ -14,7 +14,7 @@ use serde_json::json;
 
 use crate::hermite_simpson::{HermiteSimpson, Layout};
 use crate::pendulum::{Initial, Links, initial_conditions, pendulum};
-use crate::plot::{Figure, Line, Panel, Scale, Style};
+use crate::plot::{Figure, Legend, Line, Panel, Scale, Style};
 use crate::results::{Claim, Part, Table, number};
 use crate::runge_kutta::{ClassicalRk4, GaussLegendre4};
 use crate::trajectory::Method;
@@ -34,6 +34,8 @@ const METHODS: [Method; 8] = [
     Method::Rk4,
     Method::Gauss4,
 ];
+/// All iterations end at round-off (rad).
+const ROUND_OFF_CHANGE: f64 = 1e-18;
 /// Errors below are round-off, which wanders.
 const ROUND_OFF: f64 = 1e-11;
 /// Standard errors.
@@ -98,7 +100,7 @@ fn errors(
             }
         }
         Method::HermiteSimpson => {
-            let mut work = HermiteSimpson::new(tree, time_step, Layout::Reduced)?;
+            let mut work = HermiteSimpson::new(tree, time_step, Layout::Reduced, ROUND_OFF_CHANGE)?;
             work.begin(&initial.q, &initial.v);
             for _ in 0..steps {
                 work.step()?;
@@ -107,7 +109,7 @@ fn errors(
             }
         }
         Method::Gauss4 => {
-            let mut work = GaussLegendre4::new(tree, time_step)?;
+            let mut work = GaussLegendre4::new(tree, time_step, ROUND_OFF_CHANGE)?;
             work.begin(&initial.q, &initial.v);
             for _ in 0..steps {
                 if !work.step() {
@@ -149,7 +151,7 @@ fn significance(values: &[f64]) -> (f64, f64) {
     (mean, mean.abs() / (variance / n).sqrt())
 }
 
-/// Running largest error, thinned.
+/// Largest error of every stretch of time, for the plot.
 fn envelope(errors: &[f64], time_step: f64) -> Vec<(f64, f64)> {
     let stride = errors.len().div_ceil(PLOTTED);
     errors
@@ -268,10 +270,10 @@ pub fn run(campaign: &Campaign) -> Result<Part, Failure> {
             y_label: "|E - E0| / (E0 - E_rest)".into(),
             x: Scale::Linear,
             y: Scale::Log,
-            x_range: Some((0.0, 1.62 * duration)),
+            x_range: Some((0.0, duration)),
             y_range: None,
             lines,
-            legend: true,
+            legend: Legend::Beside,
         }],
     };
     campaign.draw("energy", &figure)?;

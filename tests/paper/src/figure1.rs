@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use crate::exact_newton::{CHANGE_LIMIT, ExactNewton};
 use crate::one_step::{OneStep, Outcome};
 use crate::pendulum::{Links, initial_conditions, pendulum};
-use crate::plot::{Figure, Line, Panel, Scale, Style};
+use crate::plot::{Figure, Legend, Line, Panel, Scale, Style};
 use crate::quasi_newton::QuasiNewton;
 use crate::results::{Claim, Part, Table, number};
 use crate::stopwatch::once;
@@ -324,7 +324,7 @@ fn panels_of(links: Links, rows: &[(f64, [Cell; 4])]) -> Vec<Panel> {
         x_range: None,
         y_range: None,
         lines,
-        legend: true,
+        legend: Legend::Corner,
     };
     let mut success = lines(&Cell::success);
     success.push(Line {

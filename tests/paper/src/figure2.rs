@@ -13,7 +13,7 @@ use serde_json::json;
 
 use crate::automatic::{Automatic, Depth};
 use crate::pendulum::{Initial, Links, initial_conditions, pendulum};
-use crate::plot::{Figure, Line, Panel, Scale, Style};
+use crate::plot::{Figure, Legend, Line, Panel, Scale, Style};
 use crate::results::{Claim, Part, Table, number};
 use crate::stopwatch::{batched, exponent, least, once};
 use crate::{Campaign, Failure};
@@ -342,7 +342,7 @@ fn figure(sizes: &[Size]) -> Figure {
             y: Scale::Log,
             x_range: None,
             y_range: None,
-            legend: true,
+            legend: Legend::Corner,
             lines: RIVALS
                 .iter()
                 .enumerate()

@@ -12,9 +12,10 @@
 //! That is [`Layout::Reduced`]. [`Layout::Full`] keeps `q, v, a` of the middle and the end as `6n` unknowns with `4n` linear and `2n`
 //! dynamic equations, as collocation is usually transcribed; Newton's iterates are the same, only the linear systems are larger.
 //!
-//! `2n` unknowns, as many as the variational Simpson step, analytic derivatives of inverse dynamics, dense LU with pivoting. Start, use
-//! of the Jacobian (factorised once per step, renewed when the contraction is poor, Broyden's update) and stopping rule are the
-//! integrator's own ([`delmpc_mechanics::step`]), so that only the equations differ.
+//! `2n` unknowns, as many as the variational Simpson step, analytic derivatives of inverse dynamics, dense LU with pivoting. Start
+//! (extrapolation with what it missed before and the trend of that), use of the Jacobian (factors kept over the steps, renewed when
+//! the contraction is poor, Broyden's update) and stopping rule are the integrator's own ([`delmpc_mechanics::step`]), so that only the
+//! equations differ.
 //!
 //! Source: J. T. Betts, *Practical Methods for Optimal Control and Estimation Using Nonlinear Programming*, 2nd ed., SIAM 2010, section 4.5;
 //! M. Kelly, *An introduction to trajectory optimization*, SIAM Review 59, 2017, section 4; implicit form: the paper, section 5.
@@ -28,11 +29,14 @@ use crate::pivoted_lu::PivotedLu;
 use crate::rigid_bodies::RivalError;
 
 const MAX_ITERATIONS: usize = 40;
-/// As in the integrator: a predicted, a small, a stagnating change of angles; contraction that renews.
-const PREDICTED_CHANGE: f64 = 1e-16;
+/// As in the integrator: a small, a stagnating change of angles; contraction that renews.
 const SMALL_CHANGE: f64 = 1e-14;
 const STAGNATION_CHANGE: f64 = 1e-8;
 const RENEW_CONTRACTION: f64 = 0.1;
+/// As in the integrator: when old factors give way, for how long, and the safety of a predicted second change.
+const FACTOR_ITERATIONS: usize = 2;
+const REUSE_PAUSE: u32 = 16;
+const SAFETY: f64 = 10.0;
 /// `(q, v)` of the middle and the end by `(a_0, a_m, a_1)`.
 const Q_BY_A: [[f64; 3]; 2] = [[3.0 / 48.0, 4.0 / 48.0, -1.0 / 48.0], [1.0 / 6.0, 2.0 / 6.0, 0.0]];
 const V_BY_A: [[f64; 3]; 2] = [[5.0 / 24.0, 8.0 / 24.0, -1.0 / 24.0], [1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0]];
@@ -63,6 +67,7 @@ pub struct NotConverged {
 #[derive(Clone, Debug)]
 pub struct HermiteSimpson {
     time_step: f64,
+    accuracy: f64,
     /// Inverse dynamics at the middle and at the end.
     nodes: [InverseDynamics; 2],
     /// For the acceleration at the very start.
@@ -83,18 +88,35 @@ pub struct HermiteSimpson {
     node_q: Vec<f64>,
     node_v: Vec<f64>,
     has_previous: bool,
+    /// As in the integrator: unknowns as extrapolated, what the last two extrapolations missed, and whether that has a trend.
+    extrapolated: Vec<f64>,
+    missed: [Vec<f64>; 2],
+    known_missed: usize,
+    follows_trend: bool,
+    /// As in the integrator: factors of an earlier step, what new ones took, and how long to go without old ones.
+    factored: bool,
+    new_factor_iterations: usize,
+    reuse_pause: u32,
+    quadratic: f64,
 }
 
 impl HermiteSimpson {
-    /// For steps of `time_step` (s).
+    /// For steps of `time_step` (s). The iteration ends when the next change of an angle is predicted below `accuracy`, as in
+    /// [`delmpc_mechanics::step::StepOptions::accuracy`].
     ///
     /// # Errors
     /// [`RivalError::Unsupported`].
-    pub fn new(tree: &KinematicTree, time_step: f64, layout: Layout) -> Result<Self, RivalError> {
+    pub fn new(
+        tree: &KinematicTree,
+        time_step: f64,
+        layout: Layout,
+        accuracy: f64,
+    ) -> Result<Self, RivalError> {
         let n = tree.dof();
         let order = if layout == Layout::Full { 6 * n } else { 2 * n };
         Ok(Self {
             time_step,
+            accuracy,
             nodes: [InverseDynamics::new(tree)?, InverseDynamics::new(tree)?],
             start: ArticulatedBody::new(tree)?,
             layout,
@@ -109,6 +131,14 @@ impl HermiteSimpson {
             node_q: vec![0.0; 2 * n],
             node_v: vec![0.0; 2 * n],
             has_previous: false,
+            extrapolated: vec![0.0; 2 * n],
+            missed: [vec![0.0; 2 * n], vec![0.0; 2 * n]],
+            known_missed: 0,
+            follows_trend: false,
+            factored: false,
+            new_factor_iterations: 0,
+            reuse_pause: 0,
+            quadratic: f64::INFINITY,
         })
     }
 
@@ -118,6 +148,8 @@ impl HermiteSimpson {
         self.v.copy_from_slice(v);
         self.start.acceleration_into(q, v, &mut self.a);
         self.has_previous = false;
+        self.known_missed = 0;
+        self.factored = false;
     }
 
     /// One step. No allocation.
@@ -134,7 +166,17 @@ impl HermiteSimpson {
             (middle[i], end[i]) =
                 if self.has_previous { (next(&EXTRAPOLATION[0]), next(&EXTRAPOLATION[1])) } else { (a1, a1) };
         }
+        self.extrapolated.copy_from_slice(&self.unknowns);
+        if self.known_missed > 0 {
+            for (k, x) in self.unknowns.iter_mut().enumerate() {
+                let [last, before] = [self.missed[0][k], self.missed[1][k]];
+                *x += if self.follows_trend { 2.0 * last - before } else { last };
+            }
+        }
         self.newton()?;
+        if self.has_previous {
+            self.remember_missed();
+        }
         let end = &self.unknowns[n..];
         self.q.copy_from_slice(&self.node_q[n..]);
         self.v.copy_from_slice(&self.node_v[n..]);
@@ -144,6 +186,20 @@ impl HermiteSimpson {
         }
         self.has_previous = true;
         Ok(())
+    }
+
+    fn remember_missed(&mut self) {
+        let (mut without, mut with) = (0.0f64, 0.0f64);
+        let [last, before] = &mut self.missed;
+        for (k, x) in self.unknowns.iter().enumerate() {
+            let missed = x - self.extrapolated[k];
+            let change = missed - last[k];
+            without = without.max(change.abs());
+            with = with.max((change - (last[k] - before[k])).abs());
+            (before[k], last[k]) = (last[k], missed);
+        }
+        self.follows_trend = self.known_missed == 2 && with < without;
+        self.known_missed = (self.known_missed + 1).min(2);
     }
 
     /// Accelerations at the present state, rad/s².
@@ -266,15 +322,23 @@ impl HermiteSimpson {
 
     fn newton(&mut self) -> Result<(), NotConverged> {
         let h = self.time_step;
-        let mut last = f64::INFINITY;
-        let mut fresh = false;
+        if self.reuse_pause > 0 || self.new_factor_iterations == 0 {
+            self.reuse_pause = self.reuse_pause.saturating_sub(1);
+            self.factored = false;
+        }
+        let old_factors = core::mem::take(&mut self.factored);
+        let (mut contracts, mut factorizations) = (old_factors, 0);
+        let (mut last, mut last_contraction) = (f64::INFINITY, 0.0f64);
+        self.broyden.forget();
         let size = 1.0 + self.q.iter().fold(0.0f64, |m, q| m.max(q.abs()));
+        let accuracy = self.accuracy * size;
         for iteration in 0..MAX_ITERATIONS {
             self.evaluate();
-            if iteration == 0 || !fresh {
+            if !contracts {
                 if !self.factor() {
                     break;
                 }
+                factorizations += 1;
                 self.broyden.forget();
             }
             self.solve();
@@ -293,15 +357,36 @@ impl HermiteSimpson {
                 break;
             }
             let contraction = change / last;
-            if change <= SMALL_CHANGE * size
-                || (iteration > 0 && change * contraction <= PREDICTED_CHANGE * size)
-                || (change < STAGNATION_CHANGE * size && contraction > 0.5)
+            let old = old_factors && factorizations == 0;
+            let rate = if old { contraction.max(last_contraction) } else { contraction };
+            let left = last * last_contraction * last_contraction;
+            let hidden = old && iteration > 1 && change < STAGNATION_CHANGE * size;
+            let small = if old { accuracy } else { accuracy.max(SMALL_CHANGE * size) };
+            let fresh = !old_factors && factorizations == 1;
+            if fresh && iteration == 1 {
+                self.quadratic = change / (last * last);
+            }
+            if change <= small
+                || (fresh && iteration == 0 && SAFETY * self.quadratic * change * change <= accuracy)
+                || (iteration > 0 && change * rate <= accuracy)
+                || (hidden && left <= accuracy)
+                || (!old && change < STAGNATION_CHANGE * size && contraction > 0.5)
             {
+                self.factored = true;
+                if !old_factors {
+                    if self.known_missed > 0 {
+                        self.new_factor_iterations = iteration + 1;
+                    }
+                } else if factorizations > 0 {
+                    self.reuse_pause = REUSE_PAUSE;
+                } else if iteration + 1 > self.new_factor_iterations + FACTOR_ITERATIONS {
+                    self.reuse_pause = 1;
+                }
                 self.place_nodes();
                 return Ok(());
             }
-            fresh = contraction < RENEW_CONTRACTION || iteration == 0;
-            last = change;
+            contracts = contraction < RENEW_CONTRACTION || iteration == 0;
+            (last, last_contraction) = (change, contraction);
         }
         Err(NotConverged { time_step: h, change: last, iterations: MAX_ITERATIONS })
     }
@@ -337,7 +422,7 @@ mod tests {
         let mut reference = Adaptive::new(&tree, Pair::Fehlberg78, 1e-14).unwrap();
         reference.run(&start.q, &start.v, 0.4).unwrap();
         let error = |steps: usize, layout: Layout| {
-            let mut work = HermiteSimpson::new(&tree, 0.4 / steps as f64, layout).unwrap();
+            let mut work = HermiteSimpson::new(&tree, 0.4 / steps as f64, layout, 1e-16).unwrap();
             work.begin(&start.q, &start.v);
             for _ in 0..steps {
                 work.step().unwrap();

@@ -59,14 +59,23 @@ pub struct Panel {
     pub x: Scale,
     /// Vertical axis.
     pub y: Scale,
-    /// Limits; `None`: from the points. With limits on x the legend stands at the right, in the room left for it.
+    /// Limits; `None`: from the points.
     pub x_range: Option<(f64, f64)>,
     /// Limits; `None`: from the points.
     pub y_range: Option<(f64, f64)>,
     /// What is drawn.
     pub lines: Vec<Line>,
-    /// With legend.
-    pub legend: bool,
+    /// Where the legend is.
+    pub legend: Legend,
+}
+
+/// Where a legend is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Legend {
+    /// In the corner with the fewest points.
+    Corner,
+    /// Beside the axes, where lines fill the panel.
+    Beside,
 }
 
 /// Panels in rows.
@@ -100,6 +109,8 @@ const PALETTE: [RGBColor; 8] = [
 const INK: RGBColor = RGBColor(23, 32, 43);
 const GRID: RGBColor = RGBColor(222, 227, 233);
 const FONT: &str = "sans-serif";
+/// Units of the room for a legend beside the axes.
+const LEGEND_WIDTH: f64 = 218.0;
 /// Pixels of a panel in the PNG; the SVG has half as many units.
 const PANEL: (u32, u32) = (1180, 900);
 
@@ -156,6 +167,14 @@ fn draw_panel<B: DrawingBackend>(
     let y_range = panel.y_range.map(|(a, b)| (at(panel.y, a), at(panel.y, b)));
     let (y_low, y_high) = span(points.iter().map(|p| p.1), panel.y, y_range);
     let style = |size: f64| (FONT, px(size)).into_font().color(&INK);
+    let (area, beside) = match panel.legend {
+        Legend::Corner => (area.clone(), None),
+        Legend::Beside => {
+            let (left, right) = area.split_horizontally(area.dim_in_pixel().0 as i32 - px(LEGEND_WIDTH));
+            (left, Some(right))
+        }
+    };
+    let area = &area;
     let mut chart = ChartBuilder::on(area)
         .margin(px(14.0))
         .caption(&panel.title, style(19.0))
@@ -213,13 +232,18 @@ fn draw_panel<B: DrawingBackend>(
             });
         }
     }
-    if panel.legend {
+    if let Some(beside) = beside {
+        for (k, line) in panel.lines.iter().filter(|line| !line.title.is_empty()).enumerate() {
+            let at = (px(8.0), px(60.0 + 26.0 * k as f64));
+            let colour = PALETTE[line.colour % PALETTE.len()];
+            let (left, right, dot) = legend_parts(line.style, colour, zoom);
+            beside.draw(&(EmptyElement::at(at) + left + right + dot))?;
+            beside.draw(&Text::new(line.title.clone(), (at.0 + px(34.0), at.1 - px(4.0)), style(14.5)))?;
+        }
+    } else {
         chart
             .configure_series_labels()
-            .position(match panel.x_range {
-                Some(_) => SeriesLabelPosition::MiddleRight,
-                None => legend_place(&points, (x_low, x_high), (y_low, y_high)),
-            })
+            .position(legend_place(&points, (x_low, x_high), (y_low, y_high)))
             .margin(px(10.0))
             .legend_area_size(px(34.0))
             .background_style(WHITE.mix(0.86))

@@ -9,7 +9,8 @@
 //!
 //! The adaptive ones continue with the higher order (local extrapolation). Step control: PI controller on the error relative to
 //! `tol (1 + |y|)`, root mean square; E. Hairer, S. P. Nørsett, G. Wanner, *Solving Ordinary Differential Equations I*, 2nd ed., sections II.4
-//! and IV.2. The Gauss-Legendre stages are solved by fixed-point iteration from the polynomial of the last step, to round-off.
+//! and IV.2. The Gauss-Legendre stages are solved by fixed-point iteration from the polynomial of the last step, to a given
+//! accuracy or round-off.
 
 use delmpc_mechanics::prelude::KinematicTree;
 
@@ -373,6 +374,7 @@ fn estimate(stages: &Stages, tableau: &Tableau, h: f64, error: &mut [f64]) -> f6
 pub struct GaussLegendre4 {
     bodies: ArticulatedBody,
     time_step: f64,
+    accuracy: f64,
     q: Vec<f64>,
     v: Vec<f64>,
     /// Accelerations of the stages.
@@ -385,16 +387,17 @@ pub struct GaussLegendre4 {
 const MAX_FIXED_POINT: usize = 60;
 
 impl GaussLegendre4 {
-    /// For steps of `time_step` (s).
+    /// For steps of `time_step` (s); the iteration ends when the change of an angle is below `accuracy` (rad).
     ///
     /// # Errors
     /// [`RivalError::Unsupported`].
-    pub fn new(tree: &KinematicTree, time_step: f64) -> Result<Self, RivalError> {
+    pub fn new(tree: &KinematicTree, time_step: f64, accuracy: f64) -> Result<Self, RivalError> {
         let zero = vec![0.0; tree.dof()];
         let pair = || [zero.clone(), zero.clone()];
         Ok(Self {
             bodies: ArticulatedBody::new(tree)?,
             time_step,
+            accuracy,
             q: zero.clone(),
             v: zero.clone(),
             slopes: pair(),
@@ -454,9 +457,9 @@ impl GaussLegendre4 {
                     *x = *y;
                 }
             }
-            // Done at round-off: the change is tiny, or small and no longer shrinks.
+            // Done: the change of an angle is small enough, or small and no longer shrinks (round-off).
             let small = h * change;
-            if small <= 1e-16 || (small < 1e-11 && change > 0.5 * last) {
+            if h * small <= self.accuracy || (small < 1e-11 && change > 0.5 * last) {
                 converged = true;
                 break;
             }
@@ -523,7 +526,7 @@ mod tests {
             off(work.q(), reference.q())
         };
         let gauss = |steps: usize| {
-            let mut work = GaussLegendre4::new(&tree, 0.4 / steps as f64).unwrap();
+            let mut work = GaussLegendre4::new(&tree, 0.4 / steps as f64, 1e-18).unwrap();
             work.begin(&start.q, &start.v);
             assert!((0..steps).all(|_| work.step()));
             off(work.q(), reference.q())

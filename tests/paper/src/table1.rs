@@ -160,7 +160,7 @@ fn collocation(
     implicit: bool,
 ) -> Result<Built, Failure> {
     let size = (2 * steps + 1) * tree.dof();
-    let mut work = HermiteSimpson::new(tree, TIME_STEP, Layout::Reduced)?;
+    let mut work = HermiteSimpson::new(tree, TIME_STEP, Layout::Reduced, 1e-16)?;
     work.begin(q0, v0);
     let mut nodes = [q0.to_vec(), v0.to_vec(), work.acceleration().to_vec()];
     for _ in 0..steps {

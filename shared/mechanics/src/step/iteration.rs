@@ -18,6 +18,8 @@ const CLEAN_CHANGE: f64 = 1e-13;
 const STAGNATION_CHANGE: f64 = 1e-8;
 /// Contraction above which the Newton matrix is renewed.
 const RENEW_CONTRACTION: f64 = 0.1;
+/// Contraction above which the inertia part of the Newton matrix gives way to the whole of it.
+const INERTIAL_CONTRACTION: f64 = 0.5;
 /// Iterations that cost as much as a factorisation: the factors of an earlier step may take this many more than new ones.
 const FACTOR_ITERATIONS: usize = 2;
 /// When they do not contract, this many steps begin with new factors before old ones are tried again; when they only take more
@@ -44,6 +46,11 @@ impl Integrator {
         report: &mut StepReport,
     ) -> Result<(), FactorError> {
         report.factorizations += 1;
+        if self.use_inertial && self.factor_inertia(tree).is_ok() {
+            self.broyden.forget();
+            return Ok(());
+        }
+        self.use_inertial = false;
         self.keep_factors();
         if !self.use_dense {
             let outcome = self.solver.factor(tree, &self.del);
@@ -60,6 +67,15 @@ impl Integrator {
             Some(dense) => dense.factor(tree, &self.del),
             None => self.solver.factor(tree, &self.del),
         }
+    }
+
+    /// The mass matrix at the node nearest to the middle of the step.
+    fn factor_inertia(&mut self, tree: &KinematicTree) -> Result<(), StepError> {
+        let middle = self.del.unknown_nodes().div_ceil(2);
+        for (dof, q) in self.next.q.iter_mut().enumerate() {
+            *q = self.del.node(middle, dof);
+        }
+        self.velocities.factor_at(tree, &self.next)
     }
 
     pub(super) fn keep_factors(&mut self) {
@@ -116,14 +132,17 @@ impl Integrator {
                 self.factor(tree, report)?;
                 renewed = true;
             }
-            match (&mut self.dense, self.use_dense) {
-                (Some(dense), true) => dense.solve(tree, &mut self.direction),
+            match (&mut self.dense, &mut self.inertial) {
+                (_, Some(inertial)) if self.use_inertial => {
+                    inertial.solve(self.velocities.factor(), self.del.time_step(), &mut self.direction);
+                }
+                (Some(dense), _) if self.use_dense => dense.solve(tree, &mut self.direction),
                 _ => self.solver.solve(tree, &mut self.direction),
             }
             for x in &mut self.direction {
                 *x = -*x;
             }
-            if self.options.variant == NewtonVariant::Broyden {
+            if matches!(self.options.variant, NewtonVariant::Broyden | NewtonVariant::Inertial) {
                 self.broyden.improve(&mut self.direction);
             }
             if tree.is_floating() {
@@ -147,14 +166,15 @@ impl Integrator {
             }
             let contraction = change / last_change;
             // Old factors contract unevenly: the worse of two contractions counts, and a poor one is no sign of round-off.
-            let old = old_factors && !renewed;
+            let old = (old_factors && !renewed) || self.use_inertial;
             let rate = if old { contraction.max(last_contraction) } else { contraction };
             // What is left by the contractions before this one, should round-off hide how much this change is smaller than the last.
             let left = last_change * last_contraction * last_contraction;
             let hidden = old && iteration > 1 && change < STAGNATION_CHANGE * size;
             let small = if old { self.options.accuracy } else { SMALL_CHANGE.max(self.options.accuracy) };
             // Newton's method with the matrix of the guess: the second change is as the square of the first.
-            let fresh = renewed && !limited && report.factorizations == factorizations + 1;
+            let fresh =
+                renewed && !limited && !self.use_inertial && report.factorizations == factorizations + 1;
             if fresh && iteration == 1 {
                 let ratio = change / (last_change * last_change);
                 self.quadratic = if change > CLEAN_CHANGE * size { ratio } else { self.quadratic.min(ratio) };
@@ -181,7 +201,13 @@ impl Integrator {
                 return Ok(());
             }
             let round_off = if old { CLEAN_CHANGE * size } else { 0.0 };
-            contracts = !limited && (change - round_off < RENEW_CONTRACTION * last_change || iteration == 0);
+            contracts = if self.use_inertial {
+                // The whole matrix, for the rest of the step.
+                self.use_inertial = contraction < INERTIAL_CONTRACTION || iteration == 0;
+                self.use_inertial
+            } else {
+                !limited && (change - round_off < RENEW_CONTRACTION * last_change || iteration == 0)
+            };
             (last_change, last_contraction) = (change, contraction);
         }
         Err(StepError::NotConverged { residual, change: last_change, iterations: report.iterations })
