@@ -77,8 +77,8 @@ pub mod reason {
 const GAVE_WAY: f64 = 1e-3;
 /// A plan that moves a node by more than this (rad, m) is not believed.
 const LARGEST_MOVE: f64 = 2.0;
-/// How much later than the nominal's start a state may be, s: half the time that a command's segments cover.
-const LATEST_STATE_S: f64 = 0.05;
+/// How much later than the nominal's start a state may be, in horizons: what comes after the cycle that was held up is fresh again.
+const LATEST_HORIZONS: f64 = 0.5;
 /// How much earlier than it was prepared for a state may be, in periods: the last command covers the time in between.
 const EARLIEST_PERIODS: f64 = 2.0;
 /// Cycles in a row with a large innovation before [`Verdict::ModelMismatch`].
@@ -303,7 +303,7 @@ impl Controller {
     /// The next measurement is the one at the first whole period after the last that can still be met: on a machine that is too slow
     /// for the period, a problem that is always late would be thrown away and made again every time.
     ///
-    /// Does nothing before the first good cycle. If it fails, or the measurement is of another time, the next cycle does the work.
+    /// Does nothing before the first good cycle. If it fails, or the measurement is of quite another time, the next cycle does the work.
     pub fn prepare(&mut self, clock: &dyn Clock) {
         self.prepared = None;
         if self.config.kind != ControllerKind::Mpc || !self.has_plan {
@@ -375,8 +375,8 @@ impl Controller {
         let ahead_s = self.nominal.start_s;
         // A tick that was missed makes the state later than prepared for, but what was prepared is still good for a plan; so it is for one
         // that begins a little later than it could. Doing all of it again would miss the next tick too.
-        let (earliest_s, latest_s) =
-            (measured_s - LATEST_STATE_S, start_s + EARLIEST_PERIODS * self.config.period_s);
+        let earliest_s = measured_s - LATEST_HORIZONS * self.nominal.horizon_s();
+        let latest_s = start_s + EARLIEST_PERIODS * self.config.period_s;
         if self.prepared.is_some() && (earliest_s - 1e-9..=latest_s + 1e-9).contains(&ahead_s) {
             start_s = ahead_s;
         }

@@ -169,7 +169,7 @@ fn a_machine_that_is_too_slow_prepares_for_the_tick_it_can_meet() {
     // Some periods too late for what was prepared: it serves, for the time from now on.
     prepare(&mut controller, 100_000);
     assert_eq!(cycle(&mut controller, 17 * PERIOD_NS), (true, 18 * PERIOD_NS));
-    // Far too late: made again.
+    // Half a horizon later no more: made again.
     prepare(&mut controller, 100_000);
-    assert_eq!(cycle(&mut controller, 35 * PERIOD_NS), (false, 36 * PERIOD_NS));
+    assert_eq!(cycle(&mut controller, 135 * PERIOD_NS), (false, 136 * PERIOD_NS));
 }
