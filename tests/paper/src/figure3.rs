@@ -409,8 +409,14 @@ pub fn beyond(campaign: &Campaign) -> Result<Part, Failure> {
                 legend: Legend::Beside,
                 ..panel("Variational integrators", "time step (ms)", "error (rad)", by_step)
             },
-            panel("Variational integrators", "time of 10 s (ms)", "error (rad)", ours),
-            panel("Against Runge-Kutta methods", "time of 10 s (ms)", "error (rad)", all),
+            Panel {
+                legend: Legend::Before,
+                ..panel("Variational integrators", "time of 10 s (ms)", "error (rad)", ours)
+            },
+            Panel {
+                legend: Legend::Beside,
+                ..panel("Against Runge-Kutta methods", "time of 10 s (ms)", "error (rad)", all)
+            },
         ],
     };
     campaign.draw("beyond", &figure)?;

@@ -76,6 +76,8 @@ pub enum Legend {
     Corner,
     /// Beside the axes, where lines fill the panel.
     Beside,
+    /// In the panel before.
+    Before,
 }
 
 /// Panels in rows.
@@ -168,7 +170,7 @@ fn draw_panel<B: DrawingBackend>(
     let (y_low, y_high) = span(points.iter().map(|p| p.1), panel.y, y_range);
     let style = |size: f64| (FONT, px(size)).into_font().color(&INK);
     let (area, beside) = match panel.legend {
-        Legend::Corner => (area.clone(), None),
+        Legend::Corner | Legend::Before => (area.clone(), None),
         Legend::Beside => {
             let (left, right) = area.split_horizontally(area.dim_in_pixel().0 as i32 - px(LEGEND_WIDTH));
             (left, Some(right))
@@ -240,7 +242,7 @@ fn draw_panel<B: DrawingBackend>(
             beside.draw(&(EmptyElement::at(at) + left + right + dot))?;
             beside.draw(&Text::new(line.title.clone(), (at.0 + px(34.0), at.1 - px(4.0)), style(14.5)))?;
         }
-    } else {
+    } else if panel.legend == Legend::Corner {
         chart
             .configure_series_labels()
             .position(legend_place(&points, (x_low, x_high), (y_low, y_high)))
