@@ -158,12 +158,12 @@ fn draw_panel<B: DrawingBackend>(
 ) -> Result<(), DrawingAreaErrorKind<B::ErrorType>> {
     let px = |x: f64| (x * zoom).round() as i32;
     let at = |scale: Scale, x: f64| if scale == Scale::Log { x.log10() } else { x };
-    let points: Vec<(f64, f64)> = panel
-        .lines
-        .iter()
-        .flat_map(|line| line.points.iter().map(|&(x, y)| (at(panel.x, x), at(panel.y, y))))
-        .filter(|(x, y)| x.is_finite() && y.is_finite())
-        .collect();
+    // What cannot be drawn: the logarithm of nothing, the time of what never succeeded.
+    let drawn = |line: &Line| -> Vec<(f64, f64)> {
+        let points = line.points.iter().map(|&(x, y)| (at(panel.x, x), at(panel.y, y)));
+        points.filter(|(x, y)| x.is_finite() && y.is_finite()).collect()
+    };
+    let points: Vec<(f64, f64)> = panel.lines.iter().flat_map(drawn).collect();
     let x_range = panel.x_range.map(|(a, b)| (at(panel.x, a), at(panel.x, b)));
     let (x_low, x_high) = span(points.iter().map(|p| p.0), panel.x, x_range);
     let y_range = panel.y_range.map(|(a, b)| (at(panel.y, a), at(panel.y, b)));
@@ -205,8 +205,7 @@ fn draw_panel<B: DrawingBackend>(
     for line in &panel.lines {
         let colour = PALETTE[line.colour % PALETTE.len()];
         let stroke = ShapeStyle::from(&colour).stroke_width(px(2.0) as u32);
-        let points: Vec<(f64, f64)> =
-            line.points.iter().map(|&(x, y)| (at(panel.x, x), at(panel.y, y))).collect();
+        let points = drawn(line);
         let radius = px(3.8);
         let series = match line.style {
             Style::Mark => {
@@ -416,6 +415,28 @@ mod tests {
         assert!(near(ticks(Scale::Log, -4.0, 0.0), &[-4.0, -3.0, -2.0, -1.0, 0.0]));
         assert!(near(ticks(Scale::Log, -0.1, 1.1), &[0.0, 2f64.log10(), 5f64.log10(), 1.0]));
         assert!(ticks(Scale::Log, -17.0, 3.0).len() <= 9);
+    }
+
+    #[test]
+    fn what_is_not_finite_is_left_out() {
+        let points =
+            vec![(1.0, 0.1), (2.0, f64::INFINITY), (3.0, 0.0), (4.0, f64::NAN), (f64::INFINITY, 0.2)];
+        let line = Line { title: "some fail".into(), colour: 0, style: Style::Mark, points };
+        let panel = Panel {
+            title: "failures".into(),
+            x_label: "x".into(),
+            y_label: "y".into(),
+            x: Scale::Linear,
+            y: Scale::Log,
+            x_range: None,
+            y_range: None,
+            lines: vec![line],
+            legend: Legend::Corner,
+        };
+        let folder = std::env::temp_dir().join(format!("delmpc-plot-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        write(&folder, "failures", &Figure { columns: 1, panels: vec![panel] }).unwrap();
+        std::fs::remove_dir_all(&folder).unwrap();
     }
 
     #[test]
