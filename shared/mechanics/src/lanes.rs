@@ -20,8 +20,8 @@ mod algebra;
 mod instruction_sets;
 
 pub(crate) use algebra::{
-    add, bracket, cross, cross_add, dot3, dot6, dual_bracket, halves, join, load, load_strided, mat_mul,
-    mat_tr_vec, mat_vec, mat_vec_add, outer, scale, scale_add, splat, store, sub, sym_vec,
+    Number, add, bracket, cross, cross_add, dot3, dot6, dual_bracket, halves, join, load, load_strided,
+    mat_mul, mat_tr_vec, mat_vec, mat_vec_add, outer, row, scale, scale_add, splat, store, sub, sym_vec,
 };
 pub(crate) use instruction_sets::Portable;
 

@@ -87,81 +87,56 @@ impl Simd for Portable {
     }
 }
 
+/// The operations on four lanes, which AVX2 and AVX-512 share.
+#[cfg(target_arch = "x86_64")]
+macro_rules! four_lanes_of_pulp {
+    () => {
+        const SPECIALISE: bool = true;
+        type Lanes = pulp::f64x4;
+        #[inline(always)]
+        fn splat(self, x: f64) -> pulp::f64x4 {
+            self.splat_f64x4(x)
+        }
+        #[inline(always)]
+        fn load(self, quad: &Quad) -> pulp::f64x4 {
+            pulp::cast(quad.0)
+        }
+        #[inline(always)]
+        fn store(self, lanes: pulp::f64x4) -> Quad {
+            Quad(pulp::cast(lanes))
+        }
+        #[inline(always)]
+        fn add(self, a: pulp::f64x4, b: pulp::f64x4) -> pulp::f64x4 {
+            self.add_f64x4(a, b)
+        }
+        #[inline(always)]
+        fn sub(self, a: pulp::f64x4, b: pulp::f64x4) -> pulp::f64x4 {
+            self.sub_f64x4(a, b)
+        }
+        #[inline(always)]
+        fn mul(self, a: pulp::f64x4, b: pulp::f64x4) -> pulp::f64x4 {
+            self.mul_f64x4(a, b)
+        }
+        #[inline(always)]
+        fn mul_add(self, a: pulp::f64x4, b: pulp::f64x4, c: pulp::f64x4) -> pulp::f64x4 {
+            self.mul_add_f64x4(a, b, c)
+        }
+        #[inline(always)]
+        fn neg_mul_add(self, a: pulp::f64x4, b: pulp::f64x4, c: pulp::f64x4) -> pulp::f64x4 {
+            self.negate_mul_add_f64x4(a, b, c)
+        }
+    };
+}
+
 #[cfg(target_arch = "x86_64")]
 impl Simd for pulp::x86::V3 {
-    const SPECIALISE: bool = true;
+    four_lanes_of_pulp!();
     wide_as_four_lanes!();
-    type Lanes = pulp::f64x4;
-    #[inline(always)]
-    fn splat(self, x: f64) -> pulp::f64x4 {
-        self.splat_f64x4(x)
-    }
-    #[inline(always)]
-    fn load(self, quad: &Quad) -> pulp::f64x4 {
-        pulp::cast(quad.0)
-    }
-    #[inline(always)]
-    fn store(self, lanes: pulp::f64x4) -> Quad {
-        Quad(pulp::cast(lanes))
-    }
-    #[inline(always)]
-    fn add(self, a: pulp::f64x4, b: pulp::f64x4) -> pulp::f64x4 {
-        self.add_f64x4(a, b)
-    }
-    #[inline(always)]
-    fn sub(self, a: pulp::f64x4, b: pulp::f64x4) -> pulp::f64x4 {
-        self.sub_f64x4(a, b)
-    }
-    #[inline(always)]
-    fn mul(self, a: pulp::f64x4, b: pulp::f64x4) -> pulp::f64x4 {
-        self.mul_f64x4(a, b)
-    }
-    #[inline(always)]
-    fn mul_add(self, a: pulp::f64x4, b: pulp::f64x4, c: pulp::f64x4) -> pulp::f64x4 {
-        self.mul_add_f64x4(a, b, c)
-    }
-    #[inline(always)]
-    fn neg_mul_add(self, a: pulp::f64x4, b: pulp::f64x4, c: pulp::f64x4) -> pulp::f64x4 {
-        self.negate_mul_add_f64x4(a, b, c)
-    }
 }
 
 #[cfg(target_arch = "x86_64")]
 impl Simd for pulp::x86::V4 {
-    const SPECIALISE: bool = true;
-    type Lanes = pulp::f64x4;
-    #[inline(always)]
-    fn splat(self, x: f64) -> pulp::f64x4 {
-        self.splat_f64x4(x)
-    }
-    #[inline(always)]
-    fn load(self, quad: &Quad) -> pulp::f64x4 {
-        pulp::cast(quad.0)
-    }
-    #[inline(always)]
-    fn store(self, lanes: pulp::f64x4) -> Quad {
-        Quad(pulp::cast(lanes))
-    }
-    #[inline(always)]
-    fn add(self, a: pulp::f64x4, b: pulp::f64x4) -> pulp::f64x4 {
-        self.add_f64x4(a, b)
-    }
-    #[inline(always)]
-    fn sub(self, a: pulp::f64x4, b: pulp::f64x4) -> pulp::f64x4 {
-        self.sub_f64x4(a, b)
-    }
-    #[inline(always)]
-    fn mul(self, a: pulp::f64x4, b: pulp::f64x4) -> pulp::f64x4 {
-        self.mul_f64x4(a, b)
-    }
-    #[inline(always)]
-    fn mul_add(self, a: pulp::f64x4, b: pulp::f64x4, c: pulp::f64x4) -> pulp::f64x4 {
-        self.mul_add_f64x4(a, b, c)
-    }
-    #[inline(always)]
-    fn neg_mul_add(self, a: pulp::f64x4, b: pulp::f64x4, c: pulp::f64x4) -> pulp::f64x4 {
-        self.negate_mul_add_f64x4(a, b, c)
-    }
+    four_lanes_of_pulp!();
 
     const WIDES: usize = 2;
     type Wide = [pulp::f64x8; 2];

@@ -2,9 +2,8 @@
 
 use super::memory::{Batch, END, START, Scratch};
 use super::{DERIVATIVE, NODES, Plan, WEIGHTS};
-use crate::stage_lanes::{
-    StageKernel, StageMemory, StageSimd, Stages, Stages3, Stages6, cross, dot3, dot6, halves, load, splat,
-};
+use crate::lanes::{cross, dot3, dot6, halves};
+use crate::stage_lanes::{StageKernel, StageMemory, StageSimd, Stages, Stages3, Stages6, load, splat};
 
 /// Fills the panels; with `full` also the rows of velocities and the right-hand sides.
 pub(crate) struct Assemble<'a, M> {

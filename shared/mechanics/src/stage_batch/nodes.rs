@@ -11,10 +11,12 @@
 
 use super::memory::{Batch, END, NODE_OF, START, Scratch};
 use super::{DERIVATIVE, NODES, Plan, WEIGHTS};
+use crate::lanes::{
+    add, bracket, cross, cross_add, dot3, dot6, dual_bracket, halves, join, mat_mul, mat_vec, row, scale,
+    scale_add, sub, sym_vec,
+};
 use crate::stage_lanes::{
-    StageKernel, StageMemory, StageSimd, Stages, Stages3, Stages6, add, bracket, cross, cross_add, dot3,
-    dot6, dual_bracket, halves, join, load, mat_mul, mat_vec, row, scale, scale_add, sin_cos, splat, store,
-    sub, sym_vec,
+    StageKernel, StageMemory, StageSimd, Stages, Stages3, Stages6, load, sin_cos, splat, store,
 };
 use crate::tree::{BodyConstants, NO_PARENT};
 
