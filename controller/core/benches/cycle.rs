@@ -1,6 +1,6 @@
 //! Time of one control cycle and of its parts: Atlas, 20 stages over 1 s, all constraints, one core.
 //!
-//! `cargo bench -p delmpc-controller-core --bench cycle`. The robot stands on a welded foot, is pushed, and recovers; cycles with and
+//! `cargo bench -p delmpc-controller-core --bench cycle`, numbers of stages as arguments. The robot stands on a welded foot, is pushed, and recovers; cycles with and
 //! without active constraints are counted apart. `riccati` includes the rows that were active before, `total` what was prepared ahead, `feedback` does not. Medians in
 //! µs; times depend on the machine.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
@@ -33,7 +33,8 @@ fn main() {
         "stages  constraints   cycles   state in    shift  linearise   riccati       qp   feedback    total (least)   active rows"
     );
     let atlas = atlas();
-    for stages in [10, 20, 40] {
+    let asked: Vec<usize> = std::env::args().filter_map(|argument| argument.parse().ok()).collect();
+    for stages in if asked.is_empty() { vec![10, 20, 40] } else { asked } {
         let config = ControllerConfig {
             stages: ControllerConfig::stages_for(1.0, stages, 0.005),
             ..ControllerConfig::default()

@@ -16,8 +16,8 @@ use pulp::{Simd, WithSimd};
 
 use crate::lq_stage::{Layout, LqStage};
 use crate::panel::{
-    BLOCK, Panel, TILE, Tile, Tiled, accumulate, accumulate_columns, fill, mirror_diagonal_tiles, sqrt,
-    zero_tile,
+    BLOCK, Panel, TILE, Tile, Tiled, accumulate, accumulate_columns, fill, load_tile, mirror_diagonal_tiles,
+    sqrt, store, zero_tile,
 };
 
 /// What one stage of the recursion leaves behind, beside `P_k`.
@@ -151,16 +151,9 @@ impl EliminateInputs<'_> {
     /// `p'[B A d]`.
     #[inline(always)]
     fn carry_gradient<S: Simd>(&mut self, simd: S) {
-        let (transition, carried) = (self.stage.transition(), &mut self.scratch.carried_gradient);
-        let height = transition.stride() / S::F64_LANES;
-        let registers = transition.registers::<S>();
-        for (row, whole) in tiles(0, height, 4) {
-            if whole {
-                times_vector::<S, 4>(simd, registers, height, self.gradient, carried, row);
-            } else {
-                times_vector::<S, 1>(simd, registers, height, self.gradient, carried, row);
-            }
-        }
+        let (matrix, out) = (self.stage.transition(), &mut self.scratch.carried_gradient);
+        let rows = 0..matrix.stride() / S::F64_LANES;
+        in_tiles(simd, rows, &mut TimesVector { matrix, vector: self.gradient, out });
     }
 
     /// The columns of `u` of `M`, from the diagonal down.
@@ -187,25 +180,12 @@ impl EliminateInputs<'_> {
         let (stride, lanes) = (panel.stride(), S::F64_LANES);
         let registers = stride / lanes;
         for block in (0..inputs).step_by(TILE) {
-            let end = inputs.min(block + TILE);
-            for (row, whole) in tiles(block / lanes, registers, if lanes == BLOCK { 4 } else { 2 }) {
-                if !whole {
-                    subtract_earlier::<S, 1>(simd, panel, block..end, row);
-                } else if lanes == BLOCK {
-                    subtract_earlier::<S, 4>(simd, panel, block..end, row);
-                } else {
-                    subtract_earlier::<S, 2>(simd, panel, block..end, row);
-                }
-            }
-            for j in block..end {
+            let block = block..inputs.min(block + TILE);
+            let rows = block.start / lanes..registers;
+            in_tiles(simd, rows, &mut SubtractEarlier { panel, block: block.clone() });
+            for j in block.clone() {
                 let first = j / lanes;
-                for (row, whole) in tiles(first, registers, 4) {
-                    if whole {
-                        subtract_columns::<S, 4>(simd, panel, block..j, row);
-                    } else {
-                        subtract_columns::<S, 1>(simd, panel, block..j, row);
-                    }
-                }
+                in_tiles(simd, first..registers, &mut SubtractColumns { panel, before: block.start..j });
                 let pivot = panel.column(j)[j];
                 if !(pivot > 0.0 && pivot.is_finite()) {
                     return false;
@@ -247,168 +227,174 @@ impl EliminateInputs<'_> {
     #[inline(always)]
     fn gain<S: Simd>(&mut self, simd: S) {
         let Layout { inputs, .. } = self.layout;
-        let first_x = self.layout.first_state();
+        let first = self.layout.first_state() / S::F64_LANES;
         let StageFactors { gain, input_factor } = &mut *self.factors;
-        let lanes = S::F64_LANES;
-        let registers = gain.stride() / lanes;
-        for j in 0..inputs {
-            gain.column_mut(j).copy_from_slice(&self.scratch.elimination.column(j)[first_x..]);
-        }
+        let eliminated = &self.scratch.elimination;
+        let rows = 0..gain.stride() / S::F64_LANES;
         for block in (0..inputs).step_by(TILE).rev() {
-            let end = inputs.min(block + TILE);
-            for (row, whole) in tiles(0, registers, if lanes == BLOCK { 4 } else { 2 }) {
-                if !whole {
-                    add_later::<S, 1>(simd, gain, input_factor, block..end, row);
-                } else if lanes == BLOCK {
-                    add_later::<S, 4>(simd, gain, input_factor, block..end, row);
-                } else {
-                    add_later::<S, 2>(simd, gain, input_factor, block..end, row);
-                }
+            let block = block..inputs.min(block + TILE);
+            let factor = &diagonal_block(input_factor, &block);
+            let mut work = BackSubstitute { gain, input_factor, eliminated, first, block, factor };
+            in_tiles(simd, rows.clone(), &mut work);
+        }
+    }
+}
+
+/// Something done to `R` registers of some columns at a time.
+trait InTiles {
+    /// At `row` (in registers). Implementations must be inlined always.
+    fn at<S: Simd, const R: usize>(&mut self, simd: S, row: usize);
+}
+
+/// Bands as high as the registers hold sums for, then single registers.
+#[inline(always)]
+fn in_tiles<S: Simd>(simd: S, rows: Range<usize>, work: &mut impl InTiles) {
+    let wide = S::F64_LANES == BLOCK;
+    let mut row = rows.start;
+    while row < rows.end {
+        match rows.end - row {
+            4.. if wide => {
+                work.at::<S, 4>(simd, row);
+                row += 4;
             }
-            for j in (block..end).rev() {
-                let factor = input_factor.column(j);
-                for (row, whole) in tiles(0, registers, 4) {
-                    if whole {
-                        eliminate_later::<S, 4>(simd, gain, factor, j..end, row);
-                    } else {
-                        eliminate_later::<S, 1>(simd, gain, factor, j..end, row);
-                    }
-                }
+            2.. => {
+                work.at::<S, 2>(simd, row);
+                row += 2;
+            }
+            _ => {
+                work.at::<S, 1>(simd, row);
+                row += 1;
             }
         }
     }
 }
 
-/// Registers `from..to` in tiles: `(row, true)` for whole ones of `height`, then `(row, false)` for single registers.
-#[inline(always)]
-fn tiles(from: usize, to: usize, height: usize) -> Tiles {
-    Tiles { row: from, to, height }
+/// `out = matrix vector`.
+struct TimesVector<'a> {
+    matrix: &'a Panel,
+    vector: &'a [f64],
+    out: &'a mut Panel,
 }
 
-/// See [`tiles`]. An iterator of our own, because all code between the kernels has to be inlined into the function that
-/// enables their instructions.
-struct Tiles {
-    row: usize,
-    to: usize,
-    height: usize,
-}
-
-impl Iterator for Tiles {
-    type Item = (usize, bool);
-
+impl InTiles for TimesVector<'_> {
     #[inline(always)]
-    fn next(&mut self) -> Option<(usize, bool)> {
-        let row = self.row;
-        if row >= self.to {
-            return None;
+    fn at<S: Simd, const R: usize>(&mut self, simd: S, row: usize) {
+        let height = self.matrix.stride() / S::F64_LANES;
+        let registers = self.matrix.registers::<S>();
+        let mut sums = [simd.splat_f64s(0.0); R];
+        for (l, value) in self.vector.iter().enumerate() {
+            let (factor, column) = (simd.splat_f64s(*value), &registers[l * height + row..][..R]);
+            for r in 0..R {
+                sums[r] = simd.mul_add_f64s(column[r], factor, sums[r]);
+            }
         }
-        let whole = row + self.height <= self.to;
-        self.row += if whole { self.height } else { 1 };
-        Some((row, whole))
+        self.out.registers_mut::<S>()[row..row + R].copy_from_slice(&sums);
     }
 }
 
-/// `out = matrix vector` in `R` registers from `row` on.
-#[inline(always)]
-fn times_vector<S: Simd, const R: usize>(
-    simd: S,
-    matrix: &[S::f64s],
-    height: usize,
-    vector: &[f64],
-    out: &mut Panel,
-    row: usize,
-) {
-    let mut sums = [simd.splat_f64s(0.0); R];
-    for (l, value) in vector.iter().enumerate() {
-        let (factor, column) = (simd.splat_f64s(*value), &matrix[l * height + row..][..R]);
-        for r in 0..R {
-            sums[r] = simd.mul_add_f64s(column[r], factor, sums[r]);
-        }
-    }
-    out.registers_mut::<S>()[row..row + R].copy_from_slice(&sums);
+/// `column_j -= Σ_i column_i L(j, i)`, j in the tile of columns, i before it.
+struct SubtractEarlier<'a> {
+    panel: &'a mut Panel,
+    block: Range<usize>,
 }
 
-/// `column_j -= Σ_i column_i L(j, i)`, i before the tile of columns that j is one of, in `R` registers from `row` on.
-#[inline(always)]
-fn subtract_earlier<S: Simd, const R: usize>(simd: S, panel: &mut Panel, block: Range<usize>, row: usize) {
-    let height = panel.stride() / S::F64_LANES;
-    let mut tile = zero_tile::<S, R>(simd);
-    accumulate(simd, &mut tile, (panel, row), (panel, block.start), 0..block.start);
-    let registers = panel.registers_mut::<S>();
-    for (j, sums) in block.zip(&tile) {
-        let target = &mut registers[j * height + row..][..R];
+impl InTiles for SubtractEarlier<'_> {
+    #[inline(always)]
+    fn at<S: Simd, const R: usize>(&mut self, simd: S, row: usize) {
+        let Self { panel, block } = self;
+        let mut tile = zero_tile::<S, R>(simd);
+        accumulate(simd, &mut tile, (panel, row), (panel, block.start), 0..block.start);
+        let height = panel.stride() / S::F64_LANES;
+        let registers = panel.registers_mut::<S>();
+        for (j, sums) in block.clone().zip(&tile) {
+            let target = &mut registers[j * height + row..][..R];
+            for r in 0..R {
+                target[r] = simd.sub_f64s(target[r], sums[r]);
+            }
+        }
+    }
+}
+
+/// `column_j -= Σ_i column_i L(j, i)`, j the end of the range of i.
+struct SubtractColumns<'a> {
+    panel: &'a mut Panel,
+    before: Range<usize>,
+}
+
+impl InTiles for SubtractColumns<'_> {
+    #[inline(always)]
+    fn at<S: Simd, const R: usize>(&mut self, simd: S, row: usize) {
+        let Self { panel, before } = self;
+        let (stride, j) = (panel.stride(), before.end);
+        let height = stride / S::F64_LANES;
+        let mut sums = [simd.splat_f64s(0.0); R];
+        {
+            let (registers, entries) = (panel.registers::<S>(), panel.entries());
+            for i in before.clone() {
+                let factor = simd.splat_f64s(entries[i * stride + j]);
+                let source = &registers[i * height + row..][..R];
+                for r in 0..R {
+                    sums[r] = simd.mul_add_f64s(source[r], factor, sums[r]);
+                }
+            }
+        }
+        let target = &mut panel.registers_mut::<S>()[j * height + row..][..R];
         for r in 0..R {
             target[r] = simd.sub_f64s(target[r], sums[r]);
         }
     }
 }
 
-/// `column_j -= Σ_i column_i L(j, i)`, j the end of the range of i, in `R` registers from `row` on.
+/// Lower triangular, row-major, the diagonal inverted; the identity behind its end.
+type DiagonalFactor = [[f64; TILE]; TILE];
+
+/// The block of the diagonal that belongs to a tile of columns.
 #[inline(always)]
-fn subtract_columns<S: Simd, const R: usize>(simd: S, panel: &mut Panel, before: Range<usize>, row: usize) {
-    let (stride, lanes) = (panel.stride(), S::F64_LANES);
-    let (height, j) = (stride / lanes, before.end);
-    let mut sums = [simd.splat_f64s(0.0); R];
-    {
-        let (registers, entries) = (panel.registers::<S>(), panel.entries());
-        for i in before {
-            let factor = simd.splat_f64s(entries[i * stride + j]);
-            let source = &registers[i * height + row..][..R];
+fn diagonal_block(factor: &Panel, block: &Range<usize>) -> DiagonalFactor {
+    let mut diagonal = [[0.0; TILE]; TILE];
+    for (c, row) in diagonal.iter_mut().enumerate() {
+        row[c] = 1.0;
+    }
+    for (c, j) in block.clone().enumerate() {
+        let column = &factor.column(j)[block.clone()];
+        diagonal[c][c] = 1.0 / column[c];
+        for (row, entry) in diagonal.iter_mut().zip(column).skip(c + 1) {
+            row[c] = *entry;
+        }
+    }
+    diagonal
+}
+
+/// `X_j = -(Y_j' + Σ_i X_i L(i, j)) / L(j, j)`, j in the tile of columns, i behind j; the tiles behind have theirs.
+struct BackSubstitute<'a> {
+    gain: &'a mut Panel,
+    input_factor: &'a Panel,
+    /// `Y'`, from register `first` of a column on.
+    eliminated: &'a Panel,
+    first: usize,
+    block: Range<usize>,
+    factor: &'a DiagonalFactor,
+}
+
+impl InTiles for BackSubstitute<'_> {
+    #[inline(always)]
+    fn at<S: Simd, const R: usize>(&mut self, simd: S, row: usize) {
+        let Self { gain, input_factor, eliminated, first, block, factor } = self;
+        let mut tile = load_tile::<S, R>(simd, eliminated, block.clone(), *first + row);
+        let later = block.end..input_factor.columns();
+        accumulate_columns(simd, &mut tile, (gain, row), (input_factor, block.start), later);
+        for c in (0..TILE).rev() {
+            for k in c + 1..TILE {
+                let weight = simd.splat_f64s(factor[k][c]);
+                for r in 0..R {
+                    tile[c][r] = simd.mul_add_f64s(tile[k][r], weight, tile[c][r]);
+                }
+            }
+            let scale = simd.splat_f64s(-factor[c][c]);
             for r in 0..R {
-                sums[r] = simd.mul_add_f64s(source[r], factor, sums[r]);
+                tile[c][r] = simd.mul_f64s(tile[c][r], scale);
             }
         }
-    }
-    let target = &mut panel.registers_mut::<S>()[j * height + row..][..R];
-    for r in 0..R {
-        target[r] = simd.sub_f64s(target[r], sums[r]);
-    }
-}
-
-/// `X_j += Σ_i X_i L(i, j)`, i behind the tile of columns that j is one of, in `R` registers from `row` on.
-#[inline(always)]
-fn add_later<S: Simd, const R: usize>(
-    simd: S,
-    panel: &mut Panel,
-    factor: &Panel,
-    block: Range<usize>,
-    row: usize,
-) {
-    let height = panel.stride() / S::F64_LANES;
-    let mut tile = zero_tile::<S, R>(simd);
-    accumulate_columns(simd, &mut tile, (panel, row), (factor, block.start), block.end..factor.columns());
-    let registers = panel.registers_mut::<S>();
-    for (j, sums) in block.zip(&tile) {
-        let target = &mut registers[j * height + row..][..R];
-        for r in 0..R {
-            target[r] = simd.add_f64s(target[r], sums[r]);
-        }
-    }
-}
-
-/// `X_j = -(X_j + Σ_i X_i L(i, j)) / L(j, j)`, j the first of the range and i the others, in `R` registers from `row` on.
-#[inline(always)]
-fn eliminate_later<S: Simd, const R: usize>(
-    simd: S,
-    panel: &mut Panel,
-    factor: &[f64],
-    range: Range<usize>,
-    row: usize,
-) {
-    let height = panel.stride() / S::F64_LANES;
-    let j = range.start;
-    let registers = panel.registers_mut::<S>();
-    let mut sums = [simd.splat_f64s(0.0); R];
-    sums.copy_from_slice(&registers[j * height + row..][..R]);
-    for i in j + 1..range.end {
-        let weight = simd.splat_f64s(factor[i]);
-        let source = &registers[i * height + row..][..R];
-        for r in 0..R {
-            sums[r] = simd.mul_add_f64s(source[r], weight, sums[r]);
-        }
-    }
-    let scale = simd.splat_f64s(-1.0 / factor[j]);
-    for (target, sum) in registers[j * height + row..][..R].iter_mut().zip(sums) {
-        *target = simd.mul_f64s(sum, scale);
+        store(simd, gain, &tile, row, block.start, block.len());
     }
 }
