@@ -90,11 +90,13 @@ impl Default for RigidTransform {
 
 impl RigidTransform {
     /// The pose `(1, 0)`.
+    #[inline]
     pub fn identity() -> Self {
         Self { rotation: Matrix3::identity(), translation: Vector3::zeros() }
     }
 
     /// A pure translation, m.
+    #[inline]
     pub fn from_translation(translation: Vector3<f64>) -> Self {
         Self { rotation: Matrix3::identity(), translation }
     }
@@ -108,35 +110,41 @@ impl RigidTransform {
     }
 
     /// `g⁻¹`.
+    #[inline]
     pub fn inverse(&self) -> Self {
         let rotation = self.rotation.transpose();
         Self { rotation, translation: -(rotation * self.translation) }
     }
 
     /// A point given in this frame, in the reference frame, m.
+    #[inline]
     pub fn transform_point(&self, point: &Vector3<f64>) -> Vector3<f64> {
         self.rotation * point + self.translation
     }
 
     /// `Ad_g v`: a twist given in this frame, in the reference frame.
+    #[inline]
     pub fn transform_twist(&self, twist: &Twist) -> Twist {
         let angular = self.rotation * twist.angular;
         Twist { angular, linear: self.rotation * twist.linear + self.translation.cross(&angular) }
     }
 
     /// `Ad_g⁻¹ v`: a twist given in the reference frame, in this frame.
+    #[inline]
     pub fn inverse_transform_twist(&self, twist: &Twist) -> Twist {
         let linear = twist.linear - self.translation.cross(&twist.angular);
         Twist { angular: self.rotation.tr_mul(&twist.angular), linear: self.rotation.tr_mul(&linear) }
     }
 
     /// `Ad_g⁻ᵀ F`: a wrench given in this frame, in the reference frame.
+    #[inline]
     pub fn transform_wrench(&self, wrench: &Wrench) -> Wrench {
         let force = self.rotation * wrench.force;
         Wrench { torque: self.rotation * wrench.torque + self.translation.cross(&force), force }
     }
 
     /// `Ad_gᵀ F`: a wrench given in the reference frame, in this frame.
+    #[inline]
     pub fn inverse_transform_wrench(&self, wrench: &Wrench) -> Wrench {
         let torque = wrench.torque - self.translation.cross(&wrench.force);
         Wrench { torque: self.rotation.tr_mul(&torque), force: self.rotation.tr_mul(&wrench.force) }
@@ -185,21 +193,25 @@ pub type Momentum = Wrench;
 
 impl Twist {
     /// From the two halves.
+    #[inline]
     pub fn new(angular: Vector3<f64>, linear: Vector3<f64>) -> Self {
         Self { angular, linear }
     }
 
     /// `[ω; v]` as one vector.
+    #[inline]
     pub fn to_vector(&self) -> Vector6<f64> {
         stack(&self.angular, &self.linear)
     }
 
     /// From `[ω; v]`.
+    #[inline]
     pub fn from_vector(v: &Vector6<f64>) -> Self {
         Self { angular: v.fixed_rows::<3>(0).into_owned(), linear: v.fixed_rows::<3>(3).into_owned() }
     }
 
     /// The Lie bracket `ad_self other`.
+    #[inline]
     pub fn bracket(&self, other: &Twist) -> Twist {
         Twist {
             angular: self.angular.cross(&other.angular),
@@ -210,21 +222,25 @@ impl Twist {
 
 impl Wrench {
     /// From the two halves.
+    #[inline]
     pub fn new(torque: Vector3<f64>, force: Vector3<f64>) -> Self {
         Self { torque, force }
     }
 
     /// `[τ; f]` as one vector.
+    #[inline]
     pub fn to_vector(&self) -> Vector6<f64> {
         stack(&self.torque, &self.force)
     }
 
     /// From `[τ; f]`.
+    #[inline]
     pub fn from_vector(v: &Vector6<f64>) -> Self {
         Self { torque: v.fixed_rows::<3>(0).into_owned(), force: v.fixed_rows::<3>(3).into_owned() }
     }
 
     /// The dual bracket `ad^D_F x = ad_xᵀ F`.
+    #[inline]
     pub fn dual_bracket(&self, x: &Twist) -> Wrench {
         Wrench {
             torque: self.torque.cross(&x.angular) + self.force.cross(&x.linear),
@@ -233,6 +249,7 @@ impl Wrench {
     }
 
     /// Power `Fᵀ v`, W (for a momentum: twice a kinetic energy).
+    #[inline]
     pub fn dot(&self, twist: &Twist) -> f64 {
         self.torque.dot(&twist.angular) + self.force.dot(&twist.linear)
     }
@@ -246,29 +263,34 @@ macro_rules! vector_space {
     ($type:ident, $first:ident, $second:ident) => {
         impl Add for $type {
             type Output = Self;
+            #[inline]
             fn add(self, rhs: Self) -> Self {
                 Self { $first: self.$first + rhs.$first, $second: self.$second + rhs.$second }
             }
         }
         impl AddAssign for $type {
+            #[inline]
             fn add_assign(&mut self, rhs: Self) {
                 *self = *self + rhs;
             }
         }
         impl Sub for $type {
             type Output = Self;
+            #[inline]
             fn sub(self, rhs: Self) -> Self {
                 Self { $first: self.$first - rhs.$first, $second: self.$second - rhs.$second }
             }
         }
         impl Neg for $type {
             type Output = Self;
+            #[inline]
             fn neg(self) -> Self {
                 Self { $first: -self.$first, $second: -self.$second }
             }
         }
         impl Mul<f64> for $type {
             type Output = Self;
+            #[inline]
             fn mul(self, factor: f64) -> Self {
                 Self { $first: self.$first * factor, $second: self.$second * factor }
             }
@@ -323,6 +345,7 @@ impl SpatialInertia {
     }
 
     /// Momentum `M v`.
+    #[inline]
     pub fn mul_twist(&self, twist: &Twist) -> Momentum {
         Momentum {
             torque: self.rotational * twist.angular + self.first_moment.cross(&twist.linear),
