@@ -46,17 +46,19 @@ use nalgebra::{Matrix3, Vector3};
 mod blocks;
 mod column_plan;
 mod elimination;
+mod engine;
 mod memory;
 mod nodes;
+mod outcome;
+mod plan;
 
-use crate::errors::{FactorError, ModelError, StepError};
-use crate::lanes::{Portable, Quad};
+use crate::errors::{ModelError, StepError};
 use crate::lobatto::LobattoRule;
 use crate::spatial::{Momentum, RigidTransform, Twist, Wrench};
-use crate::stage_lanes::{LARGEST_ANGLE, Oct, StageMemory, StageSimd};
+use crate::stage_lanes::{StageMemory, StageSimd};
 use crate::tree::KinematicTree;
-use column_plan::{Block, Column, columns_in_blocks};
-use memory::{Batch, Scratch, StartBody};
+use engine::{Engine, at_stage, available, block_columns, place, read, with_work, write};
+use plan::Plan;
 
 /// Nodes of a Simpson step.
 const NODES: usize = 3;
@@ -64,11 +66,6 @@ const NODES: usize = 3;
 const WEIGHTS: [f64; NODES] = [1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0];
 /// `b^{αβ}` of the Simpson rule.
 const DERIVATIVE: [[f64; NODES]; NODES] = [[-3.0, 4.0, -1.0], [-1.0, 0.0, 1.0], [1.0, -4.0, 3.0]];
-/// A pivot block whose determinant is below this part of its two products counts as singular.
-const SINGULAR_BLOCK: f64 = 1e-13;
-/// Pivots of the mass matrix below this part of the diagonal entry they came from count as zero.
-const SINGULAR_MASS: f64 = 1e-14;
-
 /// One stage as the controller has it.
 #[derive(Clone, Copy, Debug)]
 pub struct StageInput<'a> {
@@ -166,171 +163,6 @@ pub enum InstructionSet {
     Avx2,
     /// AVX-512; eight stages at a time.
     Avx512,
-}
-
-/// The tree and its index structure.
-#[derive(Clone, Debug)]
-struct Plan {
-    tree: KinematicTree,
-    n: usize,
-    gravity: [f64; 3],
-    /// First pair of every body; its pairs follow its branch, root first, itself last.
-    pair_starts: Vec<usize>,
-    /// Every joint and all beyond it, ascending.
-    subtrees: Vec<u32>,
-    subtree_starts: Vec<usize>,
-    blocks: Vec<Block>,
-    /// One column with full support: the residual.
-    everything: Block,
-    /// Where the columns of `u` and of `(q, q̇)` lie among the blocks, both padded to whole vectors of stages.
-    places: Vec<u32>,
-}
-
-impl Plan {
-    /// With blocks of `columns` columns and `count` stages in a vector.
-    fn new(tree: &KinematicTree, columns: usize, count: usize) -> Self {
-        let n = tree.dof();
-        let mut pair_starts = vec![0];
-        for i in 0..n {
-            pair_starts.push(pair_starts[i] + tree.branch(i).len());
-        }
-        let (mut subtrees, mut subtree_starts) = (Vec::new(), vec![0]);
-        for j in 0..n {
-            subtrees.extend((j..n).filter(|&i| tree.branch(i).contains(&(j as u32))).map(|i| i as u32));
-            subtree_starts.push(subtrees.len());
-        }
-        let mut depth_first: Vec<u32> = (0..n as u32).collect();
-        // Branches in lexicographic order: every joint right before what it carries.
-        depth_first.sort_by(|&a, &b| tree.branch(a as usize).cmp(tree.branch(b as usize)));
-        let subtree = |j: usize| &subtrees[subtree_starts[j]..subtree_starts[j + 1]];
-        let block = |columns| Block::new(tree, columns, |i| pair_starts[i], subtree);
-        let blocks: Vec<Block> = columns_in_blocks(&depth_first, columns).into_iter().map(block).collect();
-        let first_state = n.next_multiple_of(count);
-        let mut places = vec![0; first_state + (2 * n).next_multiple_of(count)];
-        for (at, block) in blocks.iter().enumerate() {
-            for (c, column) in block.columns.iter().enumerate() {
-                let index = column.index(n);
-                let place = if index < n { index } else { index - n + first_state };
-                places[place] = (at * 3 * n * columns + c) as u32;
-            }
-        }
-        let everything = block((0..n).map(Column::Position).collect());
-        Self {
-            tree: tree.clone(),
-            n,
-            gravity: (*tree.gravity_w()).into(),
-            blocks,
-            everything,
-            places,
-            pair_starts,
-            subtrees,
-            subtree_starts,
-        }
-    }
-
-    #[inline(always)]
-    fn pair(&self, body: usize) -> usize {
-        self.pair_starts[body]
-    }
-
-    /// The pair of a body with itself.
-    #[inline(always)]
-    fn own_pair(&self, body: usize) -> usize {
-        self.pair_starts[body + 1] - 1
-    }
-
-    #[inline(always)]
-    fn ancestors(&self, body: usize) -> &[u32] {
-        let branch = self.tree.branch(body);
-        &branch[..branch.len() - 1]
-    }
-
-    #[inline(always)]
-    fn subtree(&self, body: usize) -> &[u32] {
-        &self.subtrees[self.subtree_starts[body]..self.subtree_starts[body + 1]]
-    }
-}
-
-/// Vectors of stages with the memory layout of one instruction set.
-#[derive(Clone, Debug)]
-struct Work<M> {
-    batches: Vec<Batch<M>>,
-    scratch: Scratch<M>,
-    marks: elimination::Marks<M>,
-}
-
-#[derive(Clone, Debug)]
-enum Engine {
-    Portable(Work<Quad>),
-    #[cfg(target_arch = "x86_64")]
-    Avx2(pulp::x86::V3, Work<Quad>),
-    #[cfg(target_arch = "x86_64")]
-    Avx512(pulp::x86::V4, Work<Oct>),
-}
-
-/// `$body` with `$work` bound to the memory, whatever its layout, and `$simd` to the instructions.
-macro_rules! with_work {
-    ($engine:expr, $simd:ident, $work:ident => $body:expr) => {
-        match $engine {
-            Engine::Portable($work) => {
-                let $simd = Portable;
-                $body
-            }
-            #[cfg(target_arch = "x86_64")]
-            Engine::Avx2($simd, $work) => {
-                let $simd = *$simd;
-                $body
-            }
-            #[cfg(target_arch = "x86_64")]
-            Engine::Avx512($simd, $work) => {
-                let $simd = *$simd;
-                $body
-            }
-        }
-    };
-}
-
-/// `$body` with `$batch` and `$lane` bound to the place of a stage.
-macro_rules! at_stage {
-    ($self:expr, $stage:expr, $batch:ident, $lane:ident => $body:expr) => {
-        with_work!(&$self.engine, _simd, work => {
-            let ($batch, $lane) = place(&work.batches, $stage);
-            $body
-        })
-    };
-}
-
-fn place<M: StageMemory>(batches: &[Batch<M>], stage: usize) -> (&Batch<M>, usize) {
-    (&batches[stage / M::COUNT], stage % M::COUNT)
-}
-
-#[inline(always)]
-fn read<M: StageMemory, const N: usize>(memory: &[M; N], lane: usize) -> [f64; N] {
-    core::array::from_fn(|k| memory[k].lanes()[lane])
-}
-
-fn write<M: StageMemory>(memory: &mut [M], lane: usize, values: &[f64]) {
-    for (cell, x) in memory.iter_mut().zip(values) {
-        cell.lanes_mut()[lane] = *x;
-    }
-}
-
-impl<M: StageMemory> StartBody<M> {
-    #[inline(always)]
-    fn visit(&self, first: usize, com: Vector3<f64>, mut visit: impl FnMut(usize, &StartKinematics)) {
-        for lane in first..M::COUNT {
-            let rotation = Matrix3::from_row_slice(&read(&self.rotation, lane));
-            let position = Vector3::from(read(&self.position, lane));
-            let kinematics = StartKinematics {
-                link_pose_w: RigidTransform { rotation, translation: position - rotation * com },
-                joint_twist_w: Twist::from_vector(&read(&self.twist, lane).into()),
-                velocity_w: Twist::from_vector(&read(&self.velocity, lane).into()),
-                d_momentum_d_rate: Wrench::from_vector(&read(&self.by_rate, lane).into()),
-                d_momentum_d_q: Wrench::from_vector(&read(&self.by_q, lane).into()),
-            };
-            visit(lane - first, &kinematics);
-        }
-    }
 }
 
 /// Lifted linearisation of the stages of a horizon, with all its memory.
@@ -708,184 +540,6 @@ impl StageBatch {
     fn check_length(&self, quantity: &'static str, got: usize, expected: usize) -> Result<(), ModelError> {
         if got == expected { Ok(()) } else { Err(ModelError::Length { quantity, got, expected }) }
     }
-}
-
-/// Columns solved together: as many as the registers hold.
-fn block_columns(count: usize) -> usize {
-    if count == 8 { 6 } else { 3 }
-}
-
-/// Whether the processor has these instructions.
-fn available(instructions: InstructionSet) -> bool {
-    match instructions {
-        InstructionSet::Portable => true,
-        #[cfg(target_arch = "x86_64")]
-        InstructionSet::Avx2 => pulp::x86::V3::try_new().is_some(),
-        #[cfg(target_arch = "x86_64")]
-        InstructionSet::Avx512 => pulp::x86::V4::try_new().is_some(),
-        #[cfg(not(target_arch = "x86_64"))]
-        _ => false,
-    }
-}
-
-impl Engine {
-    fn new(tree: &KinematicTree, stages: usize, instructions: InstructionSet) -> Option<Self> {
-        match instructions {
-            InstructionSet::Portable => Some(Self::Portable(Work::new(tree, stages))),
-            #[cfg(target_arch = "x86_64")]
-            InstructionSet::Avx2 => {
-                pulp::x86::V3::try_new().map(|simd| Self::Avx2(simd, Work::new(tree, stages)))
-            }
-            #[cfg(target_arch = "x86_64")]
-            InstructionSet::Avx512 => {
-                pulp::x86::V4::try_new().map(|simd| Self::Avx512(simd, Work::new(tree, stages)))
-            }
-            #[cfg(not(target_arch = "x86_64"))]
-            _ => None,
-        }
-    }
-}
-
-impl<M: StageMemory> Work<M> {
-    fn new(tree: &KinematicTree, stages: usize) -> Self {
-        let n = tree.dof();
-        let depths = || (0..n).map(|i| tree.branch(i).len());
-        let (depth, pairs) = (depths().max().unwrap_or(0), depths().sum());
-        // One more lane for the node behind the last stage.
-        let vectors = (stages + 1).div_ceil(M::COUNT);
-        let columns = (3 * n).next_multiple_of(block_columns(M::COUNT));
-        let places = n.next_multiple_of(M::COUNT) + (2 * n).next_multiple_of(M::COUNT);
-        Self {
-            batches: vec![Batch::new(n); vectors],
-            scratch: Scratch::new(n, depth, pairs, (columns, places)),
-            marks: elimination::Marks::default(),
-        }
-    }
-
-    fn count(&self) -> usize {
-        M::COUNT
-    }
-
-    fn place_mut(&mut self, stage: usize) -> (&mut Batch<M>, usize) {
-        (&mut self.batches[stage / M::COUNT], stage % M::COUNT)
-    }
-
-    fn set(&mut self, stage: usize, input: &StageInput<'_>) {
-        let (batch, lane) = self.place_mut(stage);
-        for (memory, q) in batch.nodes.iter_mut().zip(input.nodes) {
-            write(memory, lane, q);
-        }
-        write(&mut batch.start_rate, lane, input.rate);
-        write(&mut batch.force, lane, input.force);
-        batch.time_step.lanes_mut()[lane] = input.time_step;
-    }
-
-    /// One Newton iteration of the vector that begins with stage `first`.
-    fn newton<S: StageSimd<Memory = M>>(&mut self, simd: S, plan: &Plan, first: usize) {
-        let (batch, scratch) = (&mut self.batches[first / M::COUNT], &mut self.scratch);
-        simd.run(nodes::Evaluate { plan, batch, scratch, full: false });
-        simd.run(blocks::Assemble { plan, batch, scratch, full: false });
-        simd.run(elimination::Factor { plan, batch, scratch, full: false });
-        simd.run(elimination::Correct { plan, batch, scratch, apply: true });
-    }
-
-    /// Linearises the vector that begins with stage `stages.start`. An empty range: only the kinematics of its first node.
-    fn linearize<S: StageSimd<Memory = M>>(
-        &mut self,
-        simd: S,
-        plan: &Plan,
-        stages: core::ops::Range<usize>,
-        output: &mut dyn TransitionOutput,
-        short: &mut Option<(usize, usize)>,
-    ) {
-        let (batch, scratch) = (&mut self.batches[stages.start / M::COUNT], &mut self.scratch);
-        simd.run(nodes::Evaluate { plan, batch, scratch, full: true });
-        if stages.is_empty() {
-            return;
-        }
-        simd.run(blocks::Assemble { plan, batch, scratch, full: true });
-        simd.run(elimination::Factor { plan, batch, scratch, full: true });
-        simd.run(elimination::Correct { plan, batch, scratch, apply: false });
-        simd.run(elimination::Columns { plan, batch, scratch, output, stages, short });
-    }
-
-    /// Fills the outcomes of the vector that begins with stage `first`.
-    fn judge<S: StageSimd<Memory = M>>(
-        &mut self,
-        simd: S,
-        plan: &Plan,
-        first: usize,
-        outcomes: &mut [Result<StageReport, StepError>],
-        full: bool,
-    ) {
-        let Self { batches, scratch, marks, .. } = self;
-        let batch = &batches[first / M::COUNT];
-        simd.run(elimination::Examine { plan, batch, scratch, marks, full });
-        for (lane, outcome) in outcomes.iter_mut().skip(first).take(M::COUNT).enumerate() {
-            let at = |x: &M| x.lanes()[lane];
-            let good = at(&marks.finite) == 0.0
-                && at(&marks.coordinate) <= LARGEST_ANGLE
-                && at(&marks.block) < 1.0 / SINGULAR_BLOCK
-                && at(&marks.mass) < 1.0 / SINGULAR_MASS;
-            let report = StageReport { residual: at(&marks.residual), change: at(&marks.change) };
-            *outcome = if good {
-                Ok(report)
-            } else {
-                verdict(plan, batch, lane, full, at(&marks.finite) == 0.0).map(|()| report)
-            };
-        }
-    }
-}
-
-/// What is wrong with a stage, inputs first.
-fn verdict<M: StageMemory>(
-    plan: &Plan,
-    batch: &Batch<M>,
-    lane: usize,
-    full: bool,
-    finite: bool,
-) -> Result<(), StepError> {
-    let at = |x: &M| x.lanes()[lane];
-    let bad = |entries: &[M]| entries.iter().any(|x| !at(x).is_finite());
-    for (i, constants) in plan.tree.constants().iter().enumerate() {
-        let far = |q: f64| q.is_finite() && q.abs() > LARGEST_ANGLE;
-        if constants.revolute && batch.nodes.iter().any(|node| far(at(&node[i]))) {
-            let reason = "a joint angle is beyond 1e6 rad";
-            return Err(ModelError::Unsupported { body: i, reason }.into());
-        }
-    }
-    let first = |quantity, values: &[M]| match values.iter().position(|x| !at(x).is_finite()) {
-        Some(index) => Err(StepError::NonFinite { quantity, index }),
-        None => Ok(()),
-    };
-    first("start node", &batch.nodes[0])?;
-    first("interior node", &batch.nodes[1])?;
-    first("end node", &batch.nodes[2])?;
-    first("start velocity", &batch.start_rate)?;
-    first("held joint force", &batch.force)?;
-    let residual = batch.residual.iter().position(|r| bad(r));
-    if let Some(index) = residual {
-        return Err(StepError::NonFinite { quantity: "DEL residual (joint)", index });
-    }
-    // Leaves first, as the elimination goes. Written so that a NaN counts as singular.
-    for body in (0..plan.n).rev() {
-        let [determinant, product, mass, diagonal] = batch.pivots[body].map(|x| at(&x));
-        let size = product.abs() + (product - determinant).abs();
-        let regular = determinant.abs() > SINGULAR_BLOCK * size;
-        if !regular {
-            return Err(FactorError::SingularPivot { body, pivot: determinant.abs() }.into());
-        }
-        let positive = mass > SINGULAR_MASS * diagonal.abs();
-        if full && !positive {
-            return Err(FactorError::SingularPivot { body, pivot: mass }.into());
-        }
-    }
-    // What is left: coordinates beyond 1e6 m of slides, which are none of our business, and overflow.
-    if finite {
-        return Ok(());
-    }
-    let index = batch.correction.iter().position(|entries| bad(entries)).unwrap_or(0);
-    Err(StepError::NonFinite { quantity: "correction or momentum (joint)", index })
 }
 
 #[cfg(test)]

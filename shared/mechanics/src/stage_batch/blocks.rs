@@ -1,7 +1,8 @@
 //! Algorithms 2 and 3 of a vector of stages: the 3 x 3 blocks of every pair on a branch and the right-hand sides.
 
 use super::memory::{Batch, END, START, Scratch};
-use super::{DERIVATIVE, NODES, Plan, WEIGHTS};
+use super::plan::Plan;
+use super::{DERIVATIVE, NODES, WEIGHTS};
 use crate::lanes::{cross, dot3, dot6, halves};
 use crate::stage_lanes::{StageKernel, StageMemory, StageSimd, Stages, Stages3, Stages6, load, splat};
 
@@ -119,14 +120,15 @@ fn mix<S: StageSimd>(
         store_part(forward, 4, [-h12, end_row - h22]);
         let row_of_body = [-(h00 + start_column), -h10, h20];
         let row_of_branch = [-(h00 + start_row), -h01, h02];
-        store_part(&mut scratch.sides[pair], 0, row_of_body);
-        store_part(&mut scratch.sides[pair], 3, row_of_branch);
-        store_part(&mut scratch.sides[pair], 6, [-terms[MASS]]);
+        let side = &mut scratch.sides[pair];
+        store_part(side, 0, row_of_body);
+        store_part(side, 3, row_of_branch);
+        store_part(side, 6, [-terms[MASS]]);
     }
 }
 
 #[inline(always)]
-fn store_part<S: StageSimd, const N: usize>(panel: &mut [S::Memory; 7], at: usize, v: [Stages<S>; N]) {
+fn store_part<S: StageSimd, const N: usize>(panel: &mut [S::Memory], at: usize, v: [Stages<S>; N]) {
     for k in 0..N {
         panel[at + k] = v[k].store();
     }

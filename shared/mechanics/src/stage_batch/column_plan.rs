@@ -42,6 +42,53 @@ pub(crate) struct Source {
     pub pair: u32,
 }
 
+/// Numbers of a pair among the right-hand sides: rows 0, 1, velocity of row body, column branch; the same mirrored; `-M(q^0)` and
+/// two zeros. So the side of every column in every row is three numbers on end.
+pub(crate) const SIDE: usize = 9;
+
+/// Where right-hand sides lie: those of the pairs; then three zeros; those of a force; the negative residuals, joint by joint.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Sides {
+    pub pairs: usize,
+}
+
+impl Sides {
+    /// Groups of [`SIDE`] numbers for `n` joints.
+    pub fn groups(self, n: usize) -> usize {
+        self.pairs + (6 + 3 * n).div_ceil(SIDE)
+    }
+
+    pub fn zero(self) -> usize {
+        SIDE * self.pairs
+    }
+
+    pub fn force(self) -> usize {
+        self.zero() + 3
+    }
+
+    pub fn residual(self, joint: usize) -> usize {
+        self.zero() + 6 + 3 * joint
+    }
+
+    /// Of `column` in the row of `joint`.
+    fn of(self, tree: &KinematicTree, pair: impl Fn(usize) -> usize, column: Column, joint: usize) -> usize {
+        let place = |i: usize| tree.branch(i).len() - 1;
+        let (by_body, by_branch, j) = match column {
+            Column::Force(j) if j == joint => return self.force(),
+            Column::Force(_) => return self.zero(),
+            Column::Position(j) => (0, 3, j),
+            Column::Rate(j) => (6, 6, j),
+        };
+        if tree.branch(joint).contains(&(j as u32)) {
+            SIDE * (pair(joint) + place(j)) + by_body
+        } else if tree.branch(j).contains(&(joint as u32)) {
+            SIDE * (pair(j) + place(joint)) + by_branch
+        } else {
+            self.zero()
+        }
+    }
+}
+
 /// Columns that are solved together.
 #[derive(Clone, Debug)]
 pub(crate) struct Block {
@@ -51,13 +98,30 @@ pub(crate) struct Block {
     /// The support, leaves first.
     pub rows: Vec<Row>,
     pub sources: Vec<Source>,
+    /// Per row and column the place of the right-hand side, see [`Sides`].
+    pub origins: Vec<u32>,
 }
 
 impl Block {
-    /// For these columns; `pair(i)` is the first pair of body i, `subtree(j)` holds j and all beyond.
+    /// The residual as one column.
+    pub fn residual<'a>(
+        tree: &KinematicTree,
+        sides: Sides,
+        pair: impl Fn(usize) -> usize,
+        subtree: impl Fn(usize) -> &'a [u32],
+    ) -> Self {
+        let everywhere = (0..tree.dof()).map(Column::Position).collect();
+        let mut block = Self::new(tree, everywhere, 0, sides, pair, subtree);
+        block.origins = block.rows.iter().map(|row| sides.residual(row.joint as usize) as u32).collect();
+        block
+    }
+
+    /// For these columns, up to `size`; `pair(i)` is the first pair of body i, `subtree(j)` holds j and all beyond.
     pub fn new<'a>(
         tree: &KinematicTree,
         columns: Vec<Column>,
+        size: usize,
+        sides: Sides,
         pair: impl Fn(usize) -> usize,
         subtree: impl Fn(usize) -> &'a [u32],
     ) -> Self {
@@ -78,7 +142,13 @@ impl Block {
             }
             rows.push(Row { joint: joint as u32, first, end: sources.len() as u32 });
         }
-        Self { columns, support, rows, sources }
+        let mut origins = Vec::new();
+        for row in &rows {
+            let columns = columns.iter().take(size);
+            let of_columns = columns.map(|column| sides.of(tree, &pair, *column, row.joint as usize) as u32);
+            origins.extend(of_columns.chain(core::iter::repeat(sides.zero() as u32)).take(size));
+        }
+        Self { columns, support, rows, sources, origins }
     }
 }
 

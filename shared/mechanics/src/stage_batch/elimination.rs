@@ -12,9 +12,10 @@
 //!         for i = 1..n:  x_i -= Σ_b V_ib x_b     v_i -= Σ_b (g_ib x_b + l_ib v_b)      (b in anc i)
 //! ```
 
-use super::column_plan::{Block, Column};
-use super::memory::{BackwardPanel, Batch, END, ForwardPanel, JOINTS_AT_ONCE, Scratch};
-use super::{Plan, SINGULAR_MASS, TransitionOutput, WEIGHTS};
+use super::column_plan::{Block, SIDE};
+use super::memory::{BackwardPanel, Batch, ForwardPanel, JOINTS_AT_ONCE, Scratch};
+use super::plan::Plan;
+use super::{TransitionOutput, WEIGHTS};
 use crate::stage_lanes::{StageKernel, StageMemory, StageSimd, Stages, load};
 
 /// Eliminates the Newton matrix; with `full` also the rows of velocities. The mass matrix has its factor already.
@@ -162,22 +163,25 @@ fn eliminate_velocity<S: StageSimd>(simd: S, plan: &Plan, scratch: &mut Scratch<
 /// Block columns and block rows of all pairs.
 type Panels<'a, M> = (&'a [ForwardPanel<M>], &'a [BackwardPanel<M>]);
 
-/// Solves one block of `C` columns in place.
+/// Solves one block of `C` columns.
 #[inline(always)]
 fn solve<S: StageSimd, const C: usize>(
     simd: S,
     plan: &Plan,
     block: &Block,
+    sides: &[[S::Memory; SIDE]],
     (forward, backward): Panels<'_, S::Memory>,
     columns: &mut [S::Memory],
 ) {
     let zero = Stages::splat(simd, 0.0);
-    for row in &block.rows {
+    let sides = sides.as_flattened();
+    for (row, origins) in block.rows.iter().zip(block.origins.chunks_exact(C)) {
         let at = row.joint as usize * 3 * C;
         let mut sums = [[zero; C]; 3];
-        for (sums, cells) in sums.iter_mut().zip(columns[at..at + 3 * C].chunks_exact(C)) {
-            for c in 0..C {
-                sums[c] = Stages::load(simd, &cells[c]);
+        for c in 0..C {
+            let side = &sides[origins[c] as usize..][..3];
+            for row in 0..3 {
+                sums[row][c] = Stages::load(simd, &side[row]);
             }
         }
         for source in &block.sources[row.first as usize..row.end as usize] {
@@ -250,13 +254,14 @@ impl<M: StageMemory> StageKernel<M> for Correct<'_, M> {
     #[inline(always)]
     fn run<S: StageSimd<Memory = M>>(self, simd: S) {
         let Self { plan, batch, scratch, apply } = self;
-        let Scratch { forward, backward, columns, .. } = scratch;
+        let Scratch { sides, forward, backward, columns, .. } = scratch;
         for (i, [first, second]) in batch.residual.iter().enumerate() {
-            columns[3 * i] = (-Stages::load(simd, first)).store();
-            columns[3 * i + 1] = (-Stages::load(simd, second)).store();
-            columns[3 * i + 2] = M::default();
+            let at = plan.sides.residual(i);
+            let side = &mut sides.as_flattened_mut()[at..at + 2];
+            side[0] = (-Stages::load(simd, first)).store();
+            side[1] = (-Stages::load(simd, second)).store();
         }
-        solve::<S, 1>(simd, plan, &plan.everything, (forward, backward), columns);
+        solve::<S, 1>(simd, plan, &plan.everything, sides, (forward, backward), columns);
         for (i, correction) in batch.correction.iter_mut().enumerate() {
             *correction = [columns[3 * i], columns[3 * i + 1], columns[3 * i + 2]];
             if apply {
@@ -296,63 +301,18 @@ impl<M: StageMemory> StageKernel<M> for Columns<'_, '_, M> {
 fn all_blocks<S: StageSimd, const C: usize>(simd: S, work: &mut Columns<'_, '_, S::Memory>) {
     let plan = work.plan;
     let Scratch { sides, forward, backward, columns, .. } = &mut *work.scratch;
+    let step = Stages::load(simd, &work.batch.time_step);
+    let force = &mut sides.as_flattened_mut()[plan.sides.force()..];
+    for (side, weight) in force.iter_mut().zip([-WEIGHTS[0], -WEIGHTS[1], WEIGHTS[2]]) {
+        *side = step.times(weight).store();
+    }
     for (block, columns) in plan.blocks.iter().zip(columns.chunks_exact_mut(3 * plan.n * C)) {
-        fill::<S, C>(simd, plan, block, work.batch, sides, columns);
-        solve::<S, C>(simd, plan, block, (forward, backward), columns);
+        solve::<S, C>(simd, plan, block, sides, (forward, backward), columns);
         if !work.batch.interior.is_empty() {
             keep_interior::<S::Memory, C>(plan, block, columns, &mut work.batch.interior);
         }
     }
     write::<S, C>(simd, plan, work);
-}
-
-/// The right-hand sides of a block on its support.
-#[inline(always)]
-fn fill<S: StageSimd, const C: usize>(
-    simd: S,
-    plan: &Plan,
-    block: &Block,
-    batch: &Batch<S::Memory>,
-    sides: &[[S::Memory; 7]],
-    columns: &mut [S::Memory],
-) {
-    let step = Stages::load(simd, &batch.time_step);
-    for row in &block.rows {
-        let at = row.joint as usize * 3 * C;
-        columns[at..at + 3 * C].fill(S::Memory::default());
-    }
-    for (c, &column) in block.columns.iter().enumerate() {
-        match column {
-            Column::Force(j) => {
-                for (row, weight) in [-WEIGHTS[0], -WEIGHTS[1], WEIGHTS[2]].into_iter().enumerate() {
-                    columns[(j * 3 + row) * C + c] = step.times(weight).store();
-                }
-            }
-            Column::Position(j) => {
-                for (place, &a) in plan.ancestors(j).iter().enumerate() {
-                    let side = &sides[plan.pair(j) + place];
-                    for row in 0..3 {
-                        columns[(a as usize * 3 + row) * C + c] = side[3 + row];
-                    }
-                }
-                for &i in plan.subtree(j) {
-                    let side = &sides[plan.pair(i as usize) + plan.ancestors(j).len()];
-                    for row in 0..3 {
-                        columns[(i as usize * 3 + row) * C + c] = side[row];
-                    }
-                }
-            }
-            Column::Rate(j) => {
-                for (place, &a) in plan.ancestors(j).iter().enumerate() {
-                    columns[a as usize * 3 * C + c] = sides[plan.pair(j) + place][6];
-                }
-                for &i in plan.subtree(j) {
-                    columns[i as usize * 3 * C + c] =
-                        sides[plan.pair(i as usize) + plan.ancestors(j).len()][6];
-                }
-            }
-        }
-    }
 }
 
 /// Keeps the sensitivities of the interior nodes of a solved block.
@@ -445,80 +405,5 @@ impl<M: StageMemory> StageKernel<M> for MoveInterior<'_, M> {
         for (node, sum) in batch.nodes[1].iter_mut().zip(sums.iter()) {
             *node = (Stages::load(simd, node) + Stages::load(simd, sum)).store();
         }
-    }
-}
-
-/// What [`super::StageBatch::outcome`] is made of, for all stages of a vector.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Marks<M> {
-    /// Largest absolute residual and correction of the nodes.
-    pub residual: M,
-    pub change: M,
-    /// Zero when everything is finite, otherwise NaN.
-    pub finite: M,
-    /// Largest absolute coordinate of a node.
-    pub coordinate: M,
-    /// Largest ratio of the products in the determinant of a pivot block to the determinant.
-    pub block: M,
-    /// Largest ratio of the diagonal of the mass matrix to its pivot.
-    pub mass: M,
-}
-
-/// Takes the marks of one vector of stages; `full` after a linearisation.
-pub(crate) struct Examine<'a, M> {
-    pub plan: &'a Plan,
-    pub batch: &'a Batch<M>,
-    pub scratch: &'a Scratch<M>,
-    pub marks: &'a mut Marks<M>,
-    pub full: bool,
-}
-
-impl<M: StageMemory> StageKernel<M> for Examine<'_, M> {
-    #[inline(always)]
-    fn run<S: StageSimd<Memory = M>>(self, simd: S) {
-        let Self { plan, batch, scratch, marks, full } = self;
-        let zero = Stages::splat(simd, 0.0);
-        let (mut residual, mut change, mut coordinate, mut block, mut mass) = (zero, zero, zero, zero, zero);
-        let mut finite = zero;
-        for i in 0..plan.n {
-            for alpha in 0..3 {
-                let q = Stages::load(simd, &batch.nodes[alpha][i]);
-                coordinate = coordinate.max_abs(q);
-                finite = zero.mul_add(q, finite);
-            }
-            let [first, second] = load(simd, &batch.residual[i]);
-            residual = residual.max_abs(first).max_abs(second);
-            let [middle, end, rate] = load(simd, &batch.correction[i]);
-            change = change.max_abs(middle).max_abs(end);
-            let [determinant, product, pivot, diagonal] = load(simd, &batch.pivots[i]);
-            let other = product - determinant;
-            block = block.max_abs(product / determinant).max_abs(other / determinant);
-            // In pairs: the sum of finite numbers may overflow, their products with zero do not.
-            finite = zero.mul_add(first, zero.mul_add(second, finite));
-            finite = zero.mul_add(middle, zero.mul_add(end, finite));
-            finite = zero.mul_add(determinant, zero.mul_add(product / determinant, finite));
-            finite = zero.mul_add(Stages::load(simd, &batch.start_rate[i]), finite);
-            finite = zero.mul_add(Stages::load(simd, &batch.force[i]), finite);
-            if full {
-                mass = mass.max_abs(diagonal / pivot);
-                // 2 / SINGULAR_MASS for a negative pivot, otherwise zero.
-                mass = mass.max_abs(((pivot - zero.max_abs(pivot)) / pivot).times(1.0 / SINGULAR_MASS));
-                finite = zero.mul_add(rate, zero.mul_add(pivot, finite));
-                finite = zero.mul_add(diagonal / pivot, finite);
-                finite = zero.mul_add(Stages::load(simd, &batch.end_rate[i]), finite);
-                // Momenta of the true velocities, which the columns contain but the residual does not.
-                let (start, end) = (&batch.start[i].by_q, &scratch.b[END][i]);
-                for k in 0..6 {
-                    finite = zero.mul_add(Stages::load(simd, &start[k]), finite);
-                    finite = zero.mul_add(Stages::load(simd, &end[k]), finite);
-                }
-            }
-        }
-        marks.residual = residual.store();
-        marks.change = change.store();
-        marks.finite = finite.store();
-        marks.coordinate = coordinate.store();
-        marks.block = block.store();
-        marks.mass = mass.store();
     }
 }

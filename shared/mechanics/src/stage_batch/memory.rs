@@ -4,6 +4,7 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use super::NODES;
+use super::column_plan::{SIDE, Sides};
 use crate::stage_lanes::StageMemory;
 
 /// Joints whose finished rows are turned from vectors of stages to stages at a time: what the first-level cache holds easily.
@@ -120,8 +121,8 @@ pub(crate) struct Scratch<M> {
     pub terms: Vec<[M; 16]>,
     pub forward: Vec<ForwardPanel<M>>,
     pub backward: Vec<BackwardPanel<M>>,
-    /// Right-hand sides: rows 0, 1, velocity of row body, column branch; the same mirrored; `-M(q^0)`.
-    pub sides: Vec<[M; 7]>,
+    /// Right-hand sides, [`super::column_plan::Sides`].
+    pub sides: Vec<[M; SIDE]>,
     /// Blocks of columns, one after the other, each `[(joint 3 + row) columns + column]`.
     pub columns: Vec<M>,
     /// Finished rows of some joints, all columns, stage by stage in squares.
@@ -149,7 +150,7 @@ impl<M: StageMemory> Scratch<M> {
             terms: vec![[M::default(); 16]; depth],
             forward: vec![[M::default(); 7]; pairs],
             backward: vec![[M::default(); 7]; pairs],
-            sides: vec![[M::default(); 7]; pairs],
+            sides: vec![[M::default(); SIDE]; Sides { pairs }.groups(n)],
             columns: vec![M::default(); 3 * n * columns],
             transposed: vec![M::default(); 2 * JOINTS_AT_ONCE * places],
         }

@@ -10,7 +10,8 @@
 //! because joint k moves all it carries as one body: no momenta of single bodies, no recursion for gravity.
 
 use super::memory::{Batch, END, NODE_OF, START, Scratch};
-use super::{DERIVATIVE, NODES, Plan, WEIGHTS};
+use super::plan::Plan;
+use super::{DERIVATIVE, NODES, WEIGHTS};
 use crate::lanes::{
     add, bracket, cross, cross_add, dot3, dot6, dual_bracket, halves, join, mat_mul, mat_vec, row, scale,
     scale_add, sub, sym_vec,
