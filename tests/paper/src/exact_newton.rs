@@ -13,7 +13,7 @@
 //! 0.88, 0.43, 0.21; continuation in the time step 0.97, 0.66, 0.38 at up to nine times the time; every angle limited by itself 0.90,
 //! 0.53, 0.25; plain from a Runge-Kutta step 0.87, 0.45, 0.21.
 //!
-//! `J` is factorised in the first iteration, and again when the change was limited or did not become ten times smaller; in between
+//! `J` is factorised in the first iteration, and again when the change was limited or did not become three times smaller; in between
 //! [`delmpc_mechanics::broyden`] makes the best of the factors, as in the integrator. The plain method and the second attempt factorise always.
 
 use delmpc_mechanics::broyden::Broyden;
@@ -21,14 +21,16 @@ use delmpc_mechanics::newton_direction::{NewtonDirection, NewtonMethod, NewtonSo
 
 use crate::one_step::{OneStep, Outcome, Progress};
 
-/// Iterations of the limited method from either start.
+/// Iterations of the limited method from the start.
 const MAX_ITERATIONS: usize = 60;
+/// Iterations at half the step, and at the whole one from there; best of 20 to 60 in time per solved step.
+const MAX_ITERATIONS_AGAIN: usize = 30;
 /// Iterations of the plain one: beyond, successes are accidents.
 const MAX_PLAIN_ITERATIONS: usize = 30;
 /// rad; best of 0.15, 0.2, 0.3, 0.4, 0.5.
 pub const CHANGE_LIMIT: f64 = 0.3;
-/// Contraction below which the factors are kept.
-const KEEP: f64 = 0.1;
+/// Contraction below which the factors are kept; best of 0.1, 0.2, 0.3, 0.4, 0.6.
+const KEEP: f64 = 0.3;
 
 /// Workspace of the method with one factorisation.
 #[derive(Clone, Debug)]
@@ -66,10 +68,10 @@ impl ExactNewton {
         if !problem.halve() {
             return Outcome::Failed;
         }
-        let half = self.iterate(problem, MAX_ITERATIONS, MAX_ITERATIONS, false);
+        let half = self.iterate(problem, MAX_ITERATIONS, MAX_ITERATIONS_AGAIN, false);
         match half {
             Outcome::Solved(before) if problem.restore() => {
-                self.iterate(problem, before, MAX_ITERATIONS, false)
+                self.iterate(problem, before, MAX_ITERATIONS_AGAIN, false)
             }
             _ => {
                 problem.restore();

@@ -92,7 +92,7 @@ impl Cell {
 }
 
 fn sweep(campaign: &Campaign, links: Links, time_step: f64) -> Result<[Cell; 4], Failure> {
-    let (count, repeats) = if campaign.quick { (40, 1) } else { (1000, 2) };
+    let (count, repeats) = if campaign.quick { (40, 1) } else { (1000, 6) };
     let tree = pendulum(links, LINKS)?;
     let mut problem = OneStep::new(&tree, time_step)?;
     let mut quasi = QuasiNewton::new(&tree)?;
