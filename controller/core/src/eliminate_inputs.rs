@@ -246,7 +246,7 @@ trait InTiles {
     fn at<S: Simd, const R: usize>(&mut self, simd: S, row: usize);
 }
 
-/// Bands as high as the registers hold sums for, then single registers.
+/// Bands as high as the registers hold sums for; what is left, in pairs and singly.
 #[inline(always)]
 fn in_tiles<S: Simd>(simd: S, rows: Range<usize>, work: &mut impl InTiles) {
     let wide = S::F64_LANES == BLOCK;

@@ -38,23 +38,13 @@
 //! Source: the paper, section 3.3; H. C. Andersen, *Rattle*, J. Comput. Phys. 52, 1983; order and symplecticity: L. O. Jay,
 //! SIAM J. Numer. Anal. 33, 1996. End-node multiplier for the Galerkin form and its linearisation: ours.
 
-use alloc::vec;
 use alloc::vec::Vec;
 use nalgebra::{Matrix3, Vector3};
 
-use crate::del_residual::{DeadLoad, DelWorkspace, ForceCapacity};
-use crate::dense_lu::DenseLu;
-use crate::errors::{ModelError, StepError};
-use crate::forces::StepForces;
-use crate::kinetic_hessian::KineticHessian;
+use crate::del_residual::DelWorkspace;
+use crate::errors::ModelError;
 use crate::lanes::LANES;
-use crate::lobatto::LobattoRule;
-use crate::newton_direction::{NewtonDirection, NewtonMethod, NewtonSolver};
-use crate::row_matrix::RowMatrix;
-use crate::state::State;
-use crate::step::StepReport;
 use crate::tree::KinematicTree;
-use crate::velocity::VelocityWorkspace;
 
 mod constrained_integrator;
 

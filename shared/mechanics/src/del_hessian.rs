@@ -36,15 +36,10 @@
 use alloc::vec;
 use alloc::vec::Vec;
 
-use crate::del_residual::{DelWorkspace, load_arm};
-use crate::floating_base::{BaseLanes, base_project, base_project_both, second_order, second_order_rate};
-use crate::gravity_hessian::gravity_column;
-use crate::kinetic_hessian::{CompositeLanes, composite_times, kinetic_columns, own_inertia};
-use crate::lanes::{
-    Kernel, LANES, Lane, Lane3, Lane6, Quad, Simd, add, cross, dot3, dot6, dual_bracket, halves, join, load,
-    load_strided, mat_tr_vec, outer, scale, splat, store, sub,
-};
-use crate::tree::{KinematicTree, NO_PARENT};
+use crate::del_residual::DelWorkspace;
+use crate::kinetic_hessian::CompositeLanes;
+use crate::lanes::{LANES, Lane6, Quad, Simd};
+use crate::tree::KinematicTree;
 
 mod composites;
 mod entries;
@@ -53,7 +48,6 @@ mod pairs;
 use composites::*;
 use entries::lane;
 pub(crate) use entries::{JointAndBase, PairBlock};
-use pairs::*;
 
 /// What a column coordinate (a joint or one base coordinate) brings to its pairs.
 #[derive(Clone, Copy, Debug, Default)]

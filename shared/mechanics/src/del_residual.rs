@@ -24,17 +24,14 @@ use alloc::vec::Vec;
 use nalgebra::{Matrix3, Matrix6, Vector3};
 
 use crate::errors::{ModelError, StepError};
-use crate::floating_base::{BaseLanes, base_kinematics, base_project, base_project_rate};
+use crate::floating_base::BaseLanes;
 use crate::forces::{BodySample, JointForces, StepForces};
-use crate::lanes::{
-    Instructions, Kernel, LANES, Lane, Lane3, Lane6, Lane9, Quad, Simd, add, cross, cross_add, dot6, halves,
-    join, load, mat_mul, mat_tr_vec, mat_vec, mat_vec_add, scale, splat, store, sub, sym_vec,
-};
+use crate::lanes::{Instructions, LANES, Quad};
 use crate::lobatto::LobattoRule;
 use crate::real::sin_cos;
 use crate::spatial::{RigidTransform, Twist, Wrench, exp_rotation};
 use crate::state::State;
-use crate::tree::{BodyConstants, KinematicTree, NO_PARENT};
+use crate::tree::KinematicTree;
 
 mod inward;
 mod outward;

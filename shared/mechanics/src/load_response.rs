@@ -28,23 +28,16 @@
 
 use alloc::vec;
 use alloc::vec::Vec;
-use nalgebra::{Matrix6, Vector3, Vector6};
+use nalgebra::Vector3;
 
 use crate::del_hessian::DelHessian;
 use crate::del_residual::DelWorkspace;
 use crate::errors::{ModelError, StepError};
-use crate::kinematics::{Configuration, Kinematics, Velocity};
-use crate::lanes::{
-    Instructions, Kernel, Lane, Lane3, Lane6, Quad, Simd, add, bracket, cross, cross_add, dot6, dual_bracket,
-    halves, join, load, load_strided, scale, scale_add, splat, store, sub, sym_vec,
-};
-use crate::mass_matrix::{MassMatrixWorkspace, mass_matrix_into};
-use crate::mass_matrix_factor::MassMatrixFactor;
-use crate::newton_direction::{NewtonDirection, base_matrix};
+use crate::lanes::{Instructions, Quad};
+use crate::newton_direction::NewtonDirection;
 use crate::row_matrix::RowMatrix;
-use crate::spatial::{SpatialInertia, Twist, Wrench};
-use crate::state::State;
-use crate::tree::{KinematicTree, NO_PARENT};
+use crate::spatial::Wrench;
+use crate::tree::KinematicTree;
 
 mod boundary_motion;
 mod end_momenta;

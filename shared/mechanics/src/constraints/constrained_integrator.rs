@@ -2,7 +2,24 @@
 //!
 //! Letters and equations: [`super`].
 
-use super::*;
+use alloc::vec;
+use alloc::vec::Vec;
+use nalgebra::Vector3;
+
+use super::{Constraint, ConstraintSet, DEPENDENT_ROW, MAX_ITERATIONS};
+use crate::del_residual::{DeadLoad, DelWorkspace, ForceCapacity};
+use crate::dense_lu::DenseLu;
+use crate::errors::{ModelError, StepError};
+use crate::forces::StepForces;
+use crate::kinetic_hessian::KineticHessian;
+use crate::lanes::LANES;
+use crate::lobatto::LobattoRule;
+use crate::newton_direction::{NewtonDirection, NewtonMethod, NewtonSolver};
+use crate::row_matrix::RowMatrix;
+use crate::state::State;
+use crate::step::StepReport;
+use crate::tree::KinematicTree;
+use crate::velocity::VelocityWorkspace;
 
 /// The variational integrator of a constrained fixed-base tree.
 #[derive(Clone, Debug)]

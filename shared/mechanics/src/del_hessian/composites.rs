@@ -2,7 +2,17 @@
 //!
 //! Letters and equations: [`super`].
 
-use super::*;
+use super::pairs::{MAX_GROUPS, base_columns, base_pairs, joint_base_terms, joint_pairs};
+use super::{DeadLanes, DelHessian, GeneralLanes, GeneralTerms};
+use crate::del_residual::{DelWorkspace, load_arm};
+use crate::floating_base::{BaseLanes, base_project};
+use crate::gravity_hessian::gravity_column;
+use crate::kinetic_hessian::{CompositeLanes, own_inertia};
+use crate::lanes::{
+    Kernel, LANES, Lane, Lane3, Lane6, Quad, Simd, add, cross, dot3, dot6, dual_bracket, halves, join, load,
+    load_strided, mat_tr_vec, outer, scale, splat, store, sub,
+};
+use crate::tree::{KinematicTree, NO_PARENT};
 
 pub(super) struct Assemble<'a> {
     pub(super) tree: &'a KinematicTree,

@@ -2,7 +2,7 @@
 //!
 //! Letters and equations: [`super`].
 
-use super::*;
+use crate::lanes::{LANES, Quad};
 
 /// One node of a 6-vector.
 #[inline(always)]

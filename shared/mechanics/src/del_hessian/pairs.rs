@@ -2,7 +2,18 @@
 //!
 //! Letters and equations: [`super`].
 
-use super::*;
+use super::composites::{
+    fixed_direction_gain, fixed_direction_row, general_terms, matrix_times, matrix_tr_times,
+};
+use super::{ColumnLanes, DelHessian, RowLanes};
+use crate::del_residual::DelWorkspace;
+use crate::floating_base::{BaseLanes, base_project_both, second_order, second_order_rate};
+use crate::kinetic_hessian::{composite_times, kinetic_columns};
+use crate::lanes::{
+    LANES, Lane, Lane6, Quad, Simd, add, dot3, dot6, dual_bracket, halves, join, load, mat_tr_vec, scale,
+    store, sub,
+};
+use crate::tree::KinematicTree;
 
 /// Lanes of the pair terms, per group, before the nodes are mixed.
 #[derive(Clone, Copy)]

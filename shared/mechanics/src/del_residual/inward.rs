@@ -2,7 +2,13 @@
 //!
 //! Letters and equations: [`super`].
 
-use super::*;
+use super::{BodyLanes, DeadLoad, DelWorkspace, GainLanes};
+use crate::floating_base::{base_project, base_project_rate};
+use crate::lanes::{
+    Kernel, LANES, Lane, Lane3, Lane6, Lane9, Quad, Simd, add, cross, cross_add, dot6, halves, join, load,
+    mat_tr_vec, mat_vec, mat_vec_add, scale, splat, store, sub,
+};
+use crate::tree::{BodyConstants, KinematicTree, NO_PARENT};
 
 /// A1.2 and A1.3: wrenches, articulated momenta and impulses, rows.
 pub(super) struct Inward<'a> {

@@ -2,7 +2,14 @@
 //!
 //! Letters and equations: [`super`].
 
-use super::*;
+use super::DelWorkspace;
+use crate::floating_base::base_kinematics;
+use crate::lanes::{
+    Kernel, LANES, Lane, Lane3, Lane6, Lane9, Quad, Simd, cross, cross_add, halves, join, load, mat_mul,
+    mat_tr_vec, mat_vec, mat_vec_add, scale, splat, store, sub, sym_vec,
+};
+use crate::real::sin_cos;
+use crate::tree::{BodyConstants, KinematicTree, NO_PARENT};
 
 /// A1.1: rates, poses, velocities, and each body's own momentum.
 pub(super) struct Outward<'a> {

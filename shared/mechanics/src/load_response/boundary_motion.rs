@@ -2,7 +2,18 @@
 //!
 //! Letters and equations: [`super`].
 
-use super::*;
+use alloc::vec;
+use alloc::vec::Vec;
+use nalgebra::{Vector3, Vector6};
+
+use super::LoadPoint;
+use crate::errors::{ModelError, StepError};
+use crate::kinematics::{Configuration, Kinematics, Velocity};
+use crate::mass_matrix::{MassMatrixWorkspace, mass_matrix_into};
+use crate::mass_matrix_factor::MassMatrixFactor;
+use crate::spatial::{SpatialInertia, Twist, Wrench};
+use crate::state::State;
+use crate::tree::{KinematicTree, NO_PARENT};
 
 /// Poses and velocities at a step boundary, from the state alone: `v = M(q)⁻¹ p`.
 #[derive(Clone, Debug)]

@@ -2,7 +2,20 @@
 //!
 //! Letters and equations: [`super`].
 
-use super::*;
+use nalgebra::{Matrix6, Vector6};
+
+use super::boundary_motion::BoundaryMotion;
+use super::{BodyColumns, LoadPoint};
+use crate::del_hessian::DelHessian;
+use crate::del_residual::DelWorkspace;
+use crate::lanes::{
+    Kernel, Lane, Lane3, Lane6, Simd, add, bracket, cross, cross_add, dot6, dual_bracket, halves, join, load,
+    load_strided, scale, scale_add, splat, store, sub, sym_vec,
+};
+use crate::newton_direction::base_matrix;
+use crate::row_matrix::RowMatrix;
+use crate::spatial::{SpatialInertia, Twist, Wrench};
+use crate::tree::{KinematicTree, NO_PARENT};
 
 /// `Σ_γ H[s,γ] X^γ` of the joint rows and `Σ_γ ∂P^1/∂q^γ X^γ` (without the rigid shift) of the base rows.
 pub(super) struct EndMomenta<'a> {
