@@ -2,6 +2,10 @@
 //!
 //! Cores that share caches and memory with strangers compute slower when those are busy, several times at worst, without ever being taken
 //! away: no clock of the operating system tells. The same work, timed again and again, does.
+//!
+//! A stranger on the other thread of the same core takes its arithmetic units. Work that waits for itself, one multiplication after the
+//! other, leaves them idle and hardly feels that; a control cycle keeps them full. So the arithmetic here is many sums that do not wait
+//! for each other.
 
 use std::hint::black_box;
 
@@ -9,8 +13,12 @@ use std::hint::black_box;
 const BYTES: usize = 4 << 20;
 /// Bytes of a cache line.
 const LINE: usize = 64;
-/// Steps of arithmetic per access to memory: about as long as one that the shared cache answers.
-const STEPS_PER_ACCESS: u32 = 24;
+/// Sums that go on side by side: more than an arithmetic unit has under way.
+const SUMS: usize = 64;
+/// Terms of every sum per access to memory: about as long as one that the shared cache answers.
+const TERMS_PER_ACCESS: u32 = 8;
+/// What a sum keeps of itself from term to term, so that it stays finite.
+const KEPT: f64 = 0.75;
 /// Multiplier and increment. Source: D. E. Knuth, MMIX, "The Art of Computer Programming", fascicle 1.
 const LCG: (u64, u64) = (6_364_136_223_846_793_005, 1_442_695_040_888_963_407);
 
@@ -19,23 +27,26 @@ const LCG: (u64, u64) = (6_364_136_223_846_793_005, 1_442_695_040_888_963_407);
 pub struct Probe {
     memory: Vec<u8>,
     state: u64,
+    sums: [f64; SUMS],
 }
 
 impl Probe {
     /// With all its memory touched.
     pub fn new() -> Self {
-        Self { memory: vec![1; BYTES], state: 1 }
+        Self { memory: vec![1; BYTES], state: 1, sums: [0.0; SUMS] }
     }
 
-    /// `units` accesses to memory, each of which waits for the one before, and the arithmetic that goes with them.
+    /// `units` accesses to memory, each of which waits for the arithmetic that goes with the one before.
     pub fn work(&mut self, units: u32) {
         let mut x = self.state;
         for _ in 0..units {
-            for _ in 0..STEPS_PER_ACCESS {
-                x = x.wrapping_mul(LCG.0).wrapping_add(LCG.1);
-            }
+            x = x.wrapping_mul(LCG.0).wrapping_add(LCG.1);
             let line = (x >> 33) as usize % (BYTES / LINE);
-            x = x.wrapping_add(u64::from(self.memory[line * LINE]));
+            let term = f64::from(self.memory[line * LINE]);
+            for _ in 0..TERMS_PER_ACCESS {
+                self.sums.iter_mut().for_each(|sum| *sum = *sum * KEPT + term);
+            }
+            x = x.wrapping_add(black_box(&mut self.sums)[0] as u64);
         }
         self.state = black_box(x);
     }
@@ -59,5 +70,7 @@ mod tests {
         assert_ne!(once.state, twice.state);
         twice.work(200);
         assert_eq!(once.state, twice.state);
+        let bound = 1.0 / (1.0 - KEPT);
+        assert!(once.sums.iter().all(|sum| *sum > 1.0 && *sum <= bound), "{:?}", once.sums);
     }
 }
