@@ -54,7 +54,7 @@ pub enum Work {
 }
 
 /// Units of a witness's work: some microseconds.
-const PROBE_UNITS: u32 = 100;
+const PROBE_UNITS: u32 = 60;
 /// Rounds in which an occupied thread finds out how much work takes how long.
 const CALIBRATION_ROUNDS: usize = 101;
 
