@@ -45,7 +45,7 @@ mod composites;
 mod entries;
 mod pairs;
 
-use composites::*;
+use composites::{Assemble, BasePairs, Composites};
 use entries::lane;
 pub(crate) use entries::{JointAndBase, PairBlock};
 

@@ -43,7 +43,7 @@ mod boundary_motion;
 mod end_momenta;
 
 pub use boundary_motion::BoundaryMotion;
-use end_momenta::*;
+use end_momenta::{EndMomenta, MomentumTransport, PointVelocities, base_end};
 
 /// A point of a body that carries a load.
 #[derive(Clone, Copy, Debug, PartialEq)]
