@@ -1,11 +1,11 @@
 //! `delmpc controller`: the controller process.
 
-use delmpc_controller_process::controller_loop::ControllerLoop;
+use delmpc_controller_process::controller_loop::{Controller, ControllerLoop};
 use delmpc_controller_process::figures::CycleFigures;
 use delmpc_controller_process::membership::Membership;
 use delmpc_messages::{Command, Role, Verdict};
 use delmpc_scenario::{Clock, Scenario};
-use delmpc_transport::Channel;
+use delmpc_transport::{Channel, RunId};
 
 use crate::cli::PartArguments;
 use crate::faults::FaultyController;
@@ -13,9 +13,10 @@ use crate::part::{
     Supervisor, ended, leave_part, leave_records, message_run_id, prepare_machine, run_id, say,
 };
 use crate::robot_controller::RobotController;
-use crate::run_folder::{CONTROLLER_PART, CYCLE_RECORDS};
+use crate::run_folder::{CLOCK_READINGS, CONTROLLER_PART, CYCLE_INPUTS, CYCLE_RECORDS};
 use crate::setup::Setup;
 use crate::summary::ControllerPart;
+use crate::tape::TapedController;
 use crate::verdict::{Ended, Failure};
 
 /// Runs the command. `allocations` counts the heap allocations of this process so far.
@@ -25,43 +26,74 @@ use crate::verdict::{Ended, Failure};
 pub fn controller(arguments: &PartArguments, allocations: fn() -> u64) -> Result<Ended, Failure> {
     let supervisor = Supervisor::of(arguments);
     let setup = Setup::read(&arguments.scenario, &arguments.set)?;
-    let scenario = &setup.scenario;
     let run = run_id(arguments, &setup)?;
-    let controller = RobotController::new(&setup)?;
+    let process = ControllerProcess { arguments, setup: &setup, run, supervisor, allocations };
+    if !arguments.timing {
+        let controller = RobotController::new(&setup)?;
+        warn_of_reach(&setup.scenario, controller.out_of_reach_m());
+        return Ok(process.run(controller)?.0);
+    }
+    let controller = TapedController::new(&setup)?;
+    warn_of_reach(&setup.scenario, controller.out_of_reach_m());
+    let (ended, controller) = process.run(controller)?;
+    let (inputs, readings) = controller.into_tape();
+    leave_records(arguments.out.as_deref(), CYCLE_INPUTS, &inputs)?;
+    leave_records(arguments.out.as_deref(), CLOCK_READINGS, &readings)?;
+    Ok(ended)
+}
+
+fn warn_of_reach(scenario: &Scenario, out_of_reach_m: Option<f64>) {
     let allowed_m = scenario.success.hand_error_at_deadline_m;
-    if let Some(distance_m) = controller.out_of_reach_m().filter(|distance_m| *distance_m > allowed_m) {
+    if let Some(distance_m) = out_of_reach_m.filter(|distance_m| *distance_m > allowed_m) {
         say(&format!(
             "warning: no balanced posture brings the hand nearer to the ball than {distance_m:.3} m: move `reach.ball_m`"
         ));
     }
-    let mut controller = FaultyController::new(controller, scenario);
-    prepare_machine(Role::Controller, scenario);
+}
 
-    let hash = setup.joint_set_hash();
-    let mut membership =
-        Membership::join(run, hash, Role::Controller, arguments.supervised, scenario.process.hang_s)
-            .map_err(Failure::fault)?;
-    if !arguments.supervised {
-        say(&format!("run {run}: the controller waits for a plant of the same scenario"));
+/// The process, whatever computes the commands.
+struct ControllerProcess<'a> {
+    arguments: &'a PartArguments,
+    setup: &'a Setup,
+    run: RunId,
+    supervisor: Supervisor,
+    allocations: fn() -> u64,
+}
+
+impl ControllerProcess<'_> {
+    /// Takes part in the run to its end, leaves the results, and gives the controller back.
+    fn run<C: Controller>(&self, controller: C) -> Result<(Ended, C), Failure> {
+        let Self { arguments, setup, run, supervisor, allocations } = *self;
+        let scenario = &setup.scenario;
+        let mut controller = FaultyController::new(controller, scenario);
+        let _awake = prepare_machine(Role::Controller, scenario);
+
+        let hash = setup.joint_set_hash();
+        let mut membership =
+            Membership::join(run, hash, Role::Controller, arguments.supervised, scenario.process.hang_s)
+                .map_err(Failure::fault)?;
+        if !arguments.supervised {
+            say(&format!("run {run}: the controller waits for a plant of the same scenario"));
+        }
+        let commands = membership.node().publisher(Channel::Command).map_err(Failure::fault)?;
+        let states = membership.node().subscriber(Channel::State).map_err(Failure::fault)?;
+        let blank = Command::new(message_run_id(run, scenario), hash, setup.robot.joint_names.len() as u32);
+        let mut controller_loop = ControllerLoop::new(scenario, states, commands, &blank);
+        if scenario.clock == Clock::Realtime {
+            controller_loop = controller_loop.counting(allocations);
+        }
+        if arguments.timing {
+            controller_loop = controller_loop.recording();
+        }
+        let (ending, figures, records) =
+            controller_loop.run(&mut controller, &mut membership).map_err(Failure::fault)?;
+        drop(membership);
+        supervisor.stand_in(run);
+        let folder = arguments.out.as_deref();
+        leave_records(folder, CYCLE_RECORDS, &records)?;
+        leave_part(folder, CONTROLLER_PART, &part(scenario, &figures))?;
+        Ok((ended(ending, "plant")?, controller.into_inner()))
     }
-    let commands = membership.node().publisher(Channel::Command).map_err(Failure::fault)?;
-    let states = membership.node().subscriber(Channel::State).map_err(Failure::fault)?;
-    let blank = Command::new(message_run_id(run, scenario), hash, setup.robot.joint_names.len() as u32);
-    let mut controller_loop = ControllerLoop::new(scenario, states, commands, &blank);
-    if scenario.clock == Clock::Realtime {
-        controller_loop = controller_loop.counting(allocations);
-    }
-    if arguments.timing {
-        controller_loop = controller_loop.recording();
-    }
-    let (ending, figures, records) =
-        controller_loop.run(&mut controller, &mut membership).map_err(Failure::fault)?;
-    drop(membership);
-    supervisor.stand_in(run);
-    let folder = arguments.out.as_deref();
-    leave_records(folder, CYCLE_RECORDS, &records)?;
-    leave_part(folder, CONTROLLER_PART, &part(scenario, &figures))?;
-    ended(ending, "plant")
 }
 
 /// The controller's part of the summary. Times and allocations are those of the

@@ -98,6 +98,11 @@ impl<C> FaultyController<C> {
         let link = BadLink::new(scenario, FaultTarget::State);
         Self { controller, link, last: Box::new(PlantState::new(0, 0, 0)) }
     }
+
+    /// The controller.
+    pub fn into_inner(self) -> C {
+        self.controller
+    }
 }
 
 impl<C: Controller> Controller for FaultyController<C> {

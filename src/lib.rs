@@ -25,6 +25,7 @@
 //! | [`mod@report`] | the run to look at: `report.html` and pictures of the key plots |
 //! | [`steering`] | what a person does to a running plant |
 //! | [`view`] | the live page: watch, pull, pause |
+//! | [`tape`] | everything that enters the cycles of a run, kept, and given again |
 //! | [`timing`] | the timing of the loop certified: figures, causes of missed deadlines, verdict |
 //! | [`status_line`] | one line about the running run |
 
@@ -58,6 +59,7 @@ pub mod steering;
 pub mod summary;
 pub mod summary_table;
 pub mod supervisor;
+pub mod tape;
 pub mod timing;
 pub mod truth;
 pub mod verdict;

@@ -4,6 +4,7 @@ use std::io::Write;
 use std::path::Path;
 
 use bytemuck::Pod;
+use delmpc_controller_process::awake::Awake;
 use delmpc_controller_process::controller_loop::Ending;
 use delmpc_controller_process::machine::prepare;
 use delmpc_controller_process::membership::Order;
@@ -40,23 +41,28 @@ pub fn message_run_id(run: RunId, scenario: &Scenario) -> u64 {
     }
 }
 
-/// Asks the operating system for what the scenario wants, and says what it refused. Lockstep asks for nothing.
-pub fn prepare_machine(role: Role, scenario: &Scenario) {
-    if scenario.clock == Clock::Realtime {
-        let mut process = scenario.process.clone();
-        let core = match role {
-            Role::Plant => process.plant_core,
-            _ => process.controller_core,
-        };
-        // Rate-monotonic, for the case that both share a core. Source: Liu, Layland, "Scheduling algorithms for multiprogramming in a
-        // hard-real-time environment", J. ACM 20, 1973.
-        if role == Role::Plant && process.priority > 0 {
-            process.priority = (process.priority + 1).min(99);
-        }
-        for warning in prepare(&process, core) {
-            say(&format!("warning: {warning}"));
-        }
+/// Asks the operating system for what the scenario wants, and says what it refused. Lockstep asks for nothing. The process's core, if it has
+/// one, stays awake as long as what is returned lives.
+pub fn prepare_machine(role: Role, scenario: &Scenario) -> Option<Awake> {
+    if scenario.clock == Clock::Lockstep {
+        return None;
     }
+    let mut process = scenario.process.clone();
+    let core = match role {
+        Role::Plant => process.plant_core,
+        _ => process.controller_core,
+    };
+    // Rate-monotonic, for the case that both share a core. Source: Liu, Layland, "Scheduling algorithms for multiprogramming in a
+    // hard-real-time environment", J. ACM 20, 1973.
+    if role == Role::Plant && process.priority > 0 {
+        process.priority = (process.priority + 1).min(99);
+    }
+    // Before the priority is raised: its thread would inherit that.
+    let awake = Awake::keep(&process, core);
+    for warning in prepare(&process, core) {
+        say(&format!("warning: {warning}"));
+    }
+    awake
 }
 
 /// Who supervises this process, as long as it lives.

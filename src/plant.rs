@@ -38,7 +38,7 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
         }
         _ => Log::none(),
     };
-    prepare_machine(Role::Plant, scenario);
+    let _awake = prepare_machine(Role::Plant, scenario);
 
     let hash = setup.joint_set_hash();
     let mut membership =

@@ -18,17 +18,26 @@ use crate::verdict::Failure;
 
 /// The cycle, and what times its steps.
 #[derive(Debug)]
-pub struct RobotController {
+pub struct RobotController<K = RunClock> {
     controller: core::Controller,
-    realtime: bool,
+    clock: K,
 }
 
-/// The machine's clock, for figures of time.
-struct WallClock;
+/// The clock of an ordinary run.
+#[derive(Debug, Clone, Copy)]
+pub enum RunClock {
+    /// The machine's.
+    Machine,
+    /// In lockstep nothing that depends on a clock enters the command.
+    Stopped,
+}
 
-impl CycleClock for WallClock {
+impl CycleClock for RunClock {
     fn now_ns(&self) -> u64 {
-        monotonic_ns()
+        match self {
+            Self::Machine => monotonic_ns(),
+            Self::Stopped => 0,
+        }
     }
 }
 
@@ -38,13 +47,27 @@ impl RobotController {
     /// # Errors
     /// [`Failure::Input`] when the robot cannot be controlled like that.
     pub fn new(setup: &Setup) -> Result<Self, Failure> {
+        let clock = match setup.scenario.clock {
+            Clock::Realtime => RunClock::Machine,
+            Clock::Lockstep => RunClock::Stopped,
+        };
+        Self::with_clock(setup, clock)
+    }
+}
+
+impl<K> RobotController<K> {
+    /// For a scenario, by a clock of the caller's.
+    ///
+    /// # Errors
+    /// [`Failure::Input`] when the robot cannot be controlled like that.
+    pub fn with_clock(setup: &Setup, clock: K) -> Result<Self, Failure> {
         let refused =
             |error: &dyn std::fmt::Display| Failure::Input(format!("{}: {error}", setup.scenario.name));
         let model = model(setup).map_err(|error| refused(&error))?;
         let mut controller =
             core::Controller::new(model, config(&setup.scenario)).map_err(|error| refused(&error))?;
         controller.set_origin_ns(0);
-        Ok(Self { controller, realtime: setup.scenario.clock == Clock::Realtime })
+        Ok(Self { controller, clock })
     }
 
     /// How far from the ball the hand is in the posture in which the reach ends, m: not 0 when the ball cannot be reached in balance.
@@ -57,24 +80,24 @@ impl RobotController {
     pub fn core(&self) -> &core::Controller {
         &self.controller
     }
+
+    /// What timed the steps.
+    pub fn into_clock(self) -> K {
+        self.clock
+    }
 }
 
-impl Controller for RobotController {
+impl<K: CycleClock> Controller for RobotController<K> {
     fn cycle(&mut self, state: &PlantState, now_ns: u64, command: &mut Command) {
         let (header, publish_ns) = (command.header, command.report.publish_ns);
-        *command = *self.controller.cycle(state, now_ns, clock(self.realtime));
+        *command = *self.controller.cycle(state, now_ns, &self.clock);
         command.header = header;
         command.report.publish_ns = publish_ns;
     }
 
     fn prepare(&mut self) {
-        self.controller.prepare(clock(self.realtime));
+        self.controller.prepare(&self.clock);
     }
-}
-
-/// In lockstep nothing that depends on a clock enters the command.
-fn clock(realtime: bool) -> &'static dyn CycleClock {
-    if realtime { &WallClock } else { &core::StoppedClock }
 }
 
 /// The robot fixed at its stance sole.

@@ -35,6 +35,10 @@ pub const PLANT_PART: &str = "plant.json";
 pub const CONTROLLER_PART: &str = "controller.json";
 /// Times of every cycle, left by the controller process for the timing report.
 pub const CYCLE_RECORDS: &str = "cycles.records";
+/// What entered every cycle, left by the controller process for the timing report.
+pub const CYCLE_INPUTS: &str = "inputs.records";
+/// Readings of the controller's clock, left by the controller process for the timing report.
+pub const CLOCK_READINGS: &str = "readings.records";
 /// Times of every step, left by the plant process for the timing report.
 pub const STEP_RECORDS: &str = "steps.records";
 

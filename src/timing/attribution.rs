@@ -9,14 +9,15 @@
 //!     late           |   own time + time taken                           |
 //! ```
 //!
-//! A core can also be slow without being taken away, when strangers use the caches and the memory it shares. Two signs, which must agree: the
-//! *slowness*, the longest the witness's fixed work took during the cycle, and the *pace*, the time of those stages of the cycle whose work is
-//! the same every time (linearise, Riccati), both relative to their medians over the run.
+//! A core can also be slow without being taken away, when strangers use the arithmetic units, caches and memory it shares. The proof is the
+//! cycle itself: computed *again* on the same inputs ([`crate::timing::again`]) it takes less. Where that was not possible, two signs must
+//! agree: the *slowness*, the longest the witness's fixed work took during the cycle, and the *pace*, the time of those stages of the cycle
+//! whose work is the same every time (linearise, Riccati), both relative to their medians over the run.
 //!
 //! | cause | when |
 //! |---|---|
 //! | the machine, by taking the core | the own time is within the budget, and at least `event_s` was taken |
-//! | the machine, by being slow | the slowness is at least [`SLOW`], and the own time over the pace is within the budget |
+//! | the machine, by being slow | the own time exceeds the budget, and the same cycle again does not; or the slowness is at least [`SLOW`], and the own time over the pace is within the budget |
 //! | as the cycle before | that one was still under way at the tick |
 //! | the plant, on a shared core | the own time is within the budget, and the plant had the core for longer than the machine took it |
 //! | the software | everything else, also where nothing explains it |
@@ -102,7 +103,7 @@ impl Stage {
 pub enum Cause {
     /// The core was taken away, or the thread was woken up late.
     Machine,
-    /// The core was there, but slow: the fixed work of the witness took longer too.
+    /// The core was there, but slow: the same cycle again was faster, or the fixed work of the witness took longer too.
     SlowMachine,
     /// The plant had the core that both share.
     SharedCore,
@@ -151,12 +152,16 @@ pub struct Account {
     pub slowness: f64,
     /// Time of the stages that do the same work every time over its median.
     pub pace: f64,
+    /// Least time the same cycle took when it was computed again, receiving and sending as long as usual; `None`: it was not.
+    pub again_ns: Option<u64>,
 }
 
 /// Slowness from which on a core is said to be slow. Between calm cores the fixed work varies by less.
 pub const SLOW: f64 = 1.5;
 /// The same while a cycle is still behind because of a slow core.
 const STILL_SLOW: f64 = 1.2;
+/// A cycle that took this many times as long as the same one again was disturbed.
+const DISTURBED: f64 = 1.25;
 
 impl Account {
     /// Time the cycle itself computed.
@@ -169,9 +174,19 @@ impl Account {
         self.wall_ns.saturating_sub(self.plant_ns)
     }
 
-    /// Whether the machine interfered: took the core for `event_ns`, woke the thread up that late, or was slow.
-    pub fn is_disturbed(&self, event_ns: u64) -> bool {
+    /// The least this cycle is known to take: of its own time, and that of the same cycle again.
+    pub fn software_ns(&self) -> u64 {
+        self.again_ns.map_or(self.own_ns(), |again_ns| again_ns.min(self.own_ns()))
+    }
+
+    /// Whether the machine visibly interfered: took the core for `event_ns`, woke the thread up that late, or was slow to the witness.
+    pub fn is_seen_disturbed(&self, event_ns: u64) -> bool {
         self.taken_ns >= event_ns || self.late_ns >= event_ns || self.slowness >= SLOW
+    }
+
+    /// Whether the machine interfered, visibly or not: the same cycle again took less.
+    pub fn is_disturbed(&self, event_ns: u64) -> bool {
+        self.is_seen_disturbed(event_ns) || self.own_ns() as f64 > DISTURBED * self.software_ns() as f64
     }
 }
 
@@ -239,6 +254,8 @@ pub struct Evidence<'a> {
     pub budget_ns: u64,
     /// Loss of the core from which on the machine interfered (ns).
     pub event_ns: u64,
+    /// Least time of each cycle computed again (ns).
+    pub again_ns: Option<&'a [u64]>,
 }
 
 /// What the witness of a core says.
@@ -265,8 +282,11 @@ pub fn accounts(cycles: &[CycleRecord], evidence: &Evidence<'_>) -> Vec<Account>
     let usual_ns = Times::of(work_ns).at_ns(0.5).unwrap_or(0).max(1) as f64;
     let fixed_ns = |cycle: &CycleRecord| cycle.linearize_ns + cycle.riccati_ns;
     let usual_fixed_ns = Times::of(cycles.iter().map(fixed_ns)).at_ns(0.5).unwrap_or(0).max(1) as f64;
+    let usual_ns_of =
+        |stage: Stage| Times::of(cycles.iter().map(|cycle| stage.time_ns(cycle))).at_ns(0.5).unwrap_or(0);
+    let links_ns = usual_ns_of(Stage::Receive) + usual_ns_of(Stage::Publish);
     let mut last_done_ns = 0;
-    let account = |cycle: &CycleRecord| {
+    let account = |(index, cycle): (usize, &CycleRecord)| {
         let in_cycle = [cycle.begin_ns, cycle.done_ns];
         let plant_ns = overlap(&busy, in_cycle);
         let witness = &evidence.witness;
@@ -290,9 +310,13 @@ pub fn accounts(cycles: &[CycleRecord], evidence: &Evidence<'_>) -> Vec<Account>
             slowness: slowest_ns.map_or(1.0, |slowest_ns| slowest_ns as f64 / usual_ns),
             // As if all that was taken had been taken from them.
             pace: fixed_ns(cycle).saturating_sub(taken_ns + plant_ns) as f64 / usual_fixed_ns,
+            again_ns: evidence
+                .again_ns
+                .and_then(|again| again.get(index))
+                .map(|again_ns| again_ns + links_ns),
         }
     };
-    cycles.iter().map(account).collect()
+    cycles.iter().enumerate().map(account).collect()
 }
 
 /// Every missed deadline with its cause.
@@ -374,7 +398,10 @@ fn cause_of(account: &Account, inherited: Option<Cause>, evidence: &Evidence<'_>
     let slow = if inherited == Some(Cause::SlowMachine) { STILL_SLOW } else { SLOW };
     if account.own_ns() > evidence.budget_ns {
         let at_usual_speed_ns = account.own_ns() as f64 / account.pace.max(1.0);
-        let slow = account.slowness >= slow && at_usual_speed_ns <= evidence.budget_ns as f64;
+        let slow = match account.again_ns {
+            Some(again_ns) => again_ns <= evidence.budget_ns,
+            None => account.slowness >= slow && at_usual_speed_ns <= evidence.budget_ns as f64,
+        };
         if slow { Cause::SlowMachine } else { Cause::Software }
     } else if let Some(cause) = inherited {
         cause
@@ -426,6 +453,7 @@ mod tests {
             period_ns: 5 * MS,
             budget_ns: 4 * MS,
             event_ns: MS / 10,
+            again_ns: None,
         };
         let found = misses(cycles, &accounts(cycles, &evidence), &evidence);
         found.into_iter().map(|miss| (miss.cause, miss.deadlines)).collect()
@@ -465,6 +493,7 @@ mod tests {
                 period_ns: 5 * MS,
                 budget_ns: 4 * MS,
                 event_ns: MS / 10,
+                again_ns: None,
             };
             let cycles: Vec<_> = usual().chain([CycleRecord { riccati_ns, ..cycle(9, 0, 8, 8) }]).collect();
             misses(&cycles, &accounts(&cycles, &evidence), &evidence)[0].cause
@@ -473,6 +502,32 @@ mod tests {
         assert_eq!(cause(10, 5 * MS), Cause::Software, "the witness was not slow");
         assert_eq!(cause(20, 2 * MS), Cause::Software, "the same work was not slow");
         assert_eq!(cause(20, 3 * MS), Cause::Software, "too little to explain it");
+    }
+
+    #[test]
+    fn a_slow_core_is_told_from_slow_software_by_the_same_cycle_again() {
+        let cycles: Vec<_> = (0..9).map(|k| cycle(k, 0, 3, 3)).chain([cycle(9, 0, 8, 8)]).collect();
+        let judged = |again_ns: u64| {
+            let mut again = vec![2 * MS; 9];
+            again.push(again_ns);
+            let evidence = Evidence {
+                steps: &[],
+                witness: Witness::default(),
+                one_core: false,
+                period_ns: 5 * MS,
+                budget_ns: 4 * MS,
+                event_ns: MS / 10,
+                again_ns: Some(&again),
+            };
+            let accounts = accounts(&cycles, &evidence);
+            let last = accounts[9];
+            let cause = misses(&cycles, &accounts, &evidence)[0].cause;
+            (cause, last.software_ns() / MS, last.is_disturbed(MS / 10), last.is_seen_disturbed(MS / 10))
+        };
+        assert_eq!(judged(2 * MS), (Cause::SlowMachine, 2, true, false));
+        assert_eq!(judged(5 * MS), (Cause::Software, 5, true, false), "again over budget");
+        assert_eq!(judged(7 * MS), (Cause::Software, 7, false, false), "again as long");
+        assert_eq!(judged(9 * MS), (Cause::Software, 8, false, false), "again longer");
     }
 
     #[test]
@@ -487,6 +542,7 @@ mod tests {
             period_ns: 5 * MS,
             budget_ns: 5 * MS,
             event_ns: MS / 10,
+            again_ns: None,
         };
         let found = misses(&cycles, &accounts(&cycles, &evidence), &evidence);
         assert_eq!((found.len(), found[0].stage, found[0].cause), (1, Stage::Qp, Cause::Software));

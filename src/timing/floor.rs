@@ -13,6 +13,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{Builder, JoinHandle};
 
+use delmpc_controller_process::awake::Awake;
 use delmpc_controller_process::clock::{Ticker, monotonic_ns};
 use delmpc_controller_process::machine::{is_realtime, prepare};
 use delmpc_controller_process::records::Records;
@@ -131,6 +132,7 @@ impl FloorThread {
 }
 
 fn run(settings: &FloorSettings, stop: &AtomicBool) -> FloorRun {
+    let _awake = Awake::keep(&settings.process, settings.core);
     let warnings = prepare(&settings.process, settings.core);
     let mut probe = Probe::new();
     let units = match settings.work {

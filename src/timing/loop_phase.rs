@@ -6,12 +6,15 @@ use std::path::Path;
 use bytemuck::Pod;
 use delmpc_controller_process::records::{CycleRecord, StepRecord, read_records};
 use delmpc_controller_process::stop::StopFlag;
-use delmpc_scenario::Scenario;
+use delmpc_scenario::{ProcessSettings, Scenario};
 
-use crate::run_folder::{CONTROLLER_PART, CYCLE_RECORDS, PLANT_PART, RunFolder, STEP_RECORDS};
+use crate::run_folder::{
+    CLOCK_READINGS, CONTROLLER_PART, CYCLE_INPUTS, CYCLE_RECORDS, PLANT_PART, RunFolder, STEP_RECORDS,
+};
 use crate::setup::Setup;
 use crate::summary::{ControllerPart, PlantPart, Summary};
 use crate::supervisor::{Course, Supervision, fresh_run};
+use crate::timing::again::Tape;
 use crate::timing::floor::{FloorRun, FloorSettings, FloorThread, WITNESS_NS, Work};
 use crate::verdict::Failure;
 
@@ -22,6 +25,8 @@ pub struct LoopRun {
     pub course: Course,
     /// Every cycle.
     pub cycles: Vec<CycleRecord>,
+    /// What entered the cycles.
+    pub tape: Tape,
     /// Every step.
     pub steps: Vec<StepRecord>,
     /// The witness of each core, plant's first.
@@ -74,11 +79,15 @@ pub fn run_loop(setup: &Setup, folder: &Path, stop: &StopFlag) -> Result<LoopRun
     let (plant, controller) = take_parts(&folder);
     let cycles = take_records(&folder.file(CYCLE_RECORDS));
     let steps = take_records(&folder.file(STEP_RECORDS));
+    let tape = Tape {
+        inputs: take_records(&folder.file(CYCLE_INPUTS)),
+        readings: take_records(&folder.file(CLOCK_READINGS)),
+    };
     let summary = Summary::new(scenario, plant, controller, fault);
     summary
         .write(&folder.file("summary.json"))
         .map_err(|error| Failure::Fault(format!("summary.json: {error}")))?;
-    Ok(LoopRun { course, cycles, steps, witnesses, summary, warnings })
+    Ok(LoopRun { course, cycles, tape, steps, witnesses, summary, warnings })
 }
 
 /// The cores of a scenario's processes: the plant's and the controller's.
@@ -89,7 +98,8 @@ pub fn cores_of(scenario: &Scenario) -> [usize; 2] {
 fn start_witnesses(scenario: &Scenario) -> Result<Vec<(usize, FloorThread)>, Failure> {
     let mut cores = cores_of(scenario).to_vec();
     cores.dedup();
-    let mut process = scenario.process.clone();
+    // The loop's processes keep the cores awake.
+    let mut process = ProcessSettings { keep_awake: false, ..scenario.process.clone() };
     // Above controller and plant: nothing of ours can hold it up.
     if process.priority > 0 {
         process.priority = (process.priority + 2).min(99);

@@ -5,15 +5,17 @@
 //! | floor | an idle thread on an absolute timer on each core, alone and beside a co-load | how late this machine wakes anybody up |
 //! | loop | plant and controller as two processes, each on its core, watched by a witness thread | every latency, every missed deadline and its cause |
 //! | stress | the same beside memory, cache and system-call load of ordinary priority | the same |
+//! | again | every cycle of the loop once more from its inputs, several times | which part of its time is the software's |
 //! | occupied floor | a thread whose fixed work takes as long as a cycle | the share of deadlines this machine makes anybody miss |
 //! | transport | two processes that poll, beside a bare flag | what the link costs |
 //!
 //! With `--faults` it runs every fault of a scenario instead ([`campaign`]).
 //!
-//! Files: [`floor`], [`co_load`], [`transport`] measure; [`loop_phase`] runs the processes; [`attribution`] finds who missed a deadline;
-//! [`phases`] makes figures, [`mod@criteria`] judges, [`mod@table`] and [`pictures`] show. What the operating system refuses is a warning, and the
-//! thresholds relative to the floor still hold.
+//! Files: [`floor`], [`co_load`], [`transport`] measure; [`loop_phase`] runs the processes, [`again`] computes their cycles again;
+//! [`attribution`] finds who missed a deadline; [`phases`] makes figures, [`mod@criteria`] judges, [`mod@table`] and [`pictures`] show. What the
+//! operating system refuses is a warning, and the thresholds relative to the floor still hold.
 
+pub mod again;
 pub mod attribution;
 pub mod campaign;
 pub mod co_load;
@@ -43,8 +45,8 @@ use crate::timing::phases::{FloorFigures, LoopFigures, Phases, without_privilege
 use crate::timing::transport::{TransportReport, TransportSettings, measure};
 use crate::verdict::{Ended, Failure};
 
-/// Messages of each transport measurement.
-const MESSAGES: u64 = 50_000;
+/// Messages of each transport measurement in each of its rounds.
+const MESSAGES: u64 = 10_000;
 
 /// Arguments of `delmpc timing`.
 #[derive(Debug, Clone, clap::Args)]
@@ -239,10 +241,13 @@ fn all_phases(
     for &loaded in loads {
         let (name, with) = if loaded { ("loop-load", ", co-load") } else { ("loop", "") };
         tell(&format!("loop{with}"));
-        loops.push(phases.run_loop(&folder.join(name), loaded)?);
+        let done = phases.run_loop(&folder.join(name), loaded)?;
         if stop.is_set() {
             return Ok(None);
         }
+        tell(&format!("the cycles of the loop again{with}"));
+        let Some(figures) = phases.loop_figures(done)? else { return Ok(None) };
+        loops.push(figures);
     }
     for (figures, &loaded) in loops.iter().zip(loads) {
         let with = if loaded { ", co-load" } else { "" };

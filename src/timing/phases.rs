@@ -10,6 +10,7 @@ use serde::Serialize;
 
 use crate::setup::Setup;
 use crate::supervisor::Course;
+use crate::timing::again::{Again, compute_again};
 use crate::timing::attribution::{
     Account, Cause, Evidence, LongCycle, Miss, Stage, Witness, accounts, longest_undisturbed, misses,
 };
@@ -88,8 +89,13 @@ pub struct LoopFigures {
     pub witnesses: Vec<Quantity>,
     /// Cycles in which the machine took the core for `event_s` or more, woke the thread up that late, or was slow.
     pub disturbed_cycles: u64,
-    /// 99.9 % over the median of the cycles' computing time, in undisturbed cycles.
+    /// 99.9 % over the median of the time that cycles take of themselves: of those computed again the least, otherwise of those in which the
+    /// machine did not visibly interfere.
     pub compute_spread: Option<f64>,
+    /// The same of the times of this run alone, in cycles in which the machine did not visibly interfere.
+    pub compute_spread_seen: Option<f64>,
+    /// The cycles computed again; nothing when that was not possible.
+    pub again: Option<AgainFigures>,
     /// The longest of these.
     pub longest_undisturbed: Vec<LongCycle>,
     /// The longest a cycle itself computed (s).
@@ -118,6 +124,20 @@ pub struct LoopFigures {
     pub fell: bool,
     /// What the co-load did.
     pub load: Option<LoadDone>,
+}
+
+/// The cycles of the run computed again.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct AgainFigures {
+    /// Times all of them were computed.
+    pub passes: u32,
+    /// Commands that came out differently; with any, nothing else here says anything.
+    pub different: u64,
+    /// Least time of every cycle.
+    pub least: Quantity,
+    /// Part of the jitter of the computing time that repeats: deviations of the least times from their median, over these and what the run
+    /// took above them.
+    pub software_share_of_jitter: f64,
 }
 
 /// Page faults and context switches.
@@ -228,11 +248,11 @@ impl Phases<'_> {
     ///
     /// # Errors
     /// When it cannot be started.
-    pub fn run_loop(&mut self, folder: &Path, loaded: bool) -> Result<LoopFigures, Failure> {
+    pub fn run_loop(&mut self, folder: &Path, loaded: bool) -> Result<LoopDone, Failure> {
         let setup = self.setup;
         let load = loaded.then(|| CoLoad::start(&cores_of(&setup.scenario))).transpose()?;
         let run = run_loop(setup, folder, self.stop);
-        let done = load.map(CoLoad::finish);
+        let load = load.map(CoLoad::finish);
         let run = run?;
         self.warn("", &run.warnings);
         for (_, witness) in &run.witnesses {
@@ -242,8 +262,47 @@ impl Phases<'_> {
                 self.warn("witness", &[what.to_owned()]);
             }
         }
-        Ok(loop_figures(&setup.scenario, &run, done))
+        Ok(LoopDone { run, load })
     }
+
+    /// The figures of a loop, for which its cycles are computed again. `None`: interrupted.
+    ///
+    /// # Errors
+    /// When that cannot be done.
+    pub fn loop_figures(&mut self, done: LoopDone) -> Result<Option<LoopFigures>, Failure> {
+        let LoopDone { run, load } = done;
+        let scenario = self.scenario();
+        let (budget_ns, spread_most) = (budget_ns(scenario), scenario.timing.compute_spread);
+        let settled = |least_ns: &[u64]| {
+            let times = Times::of(least_ns.iter().copied());
+            spread(&times).is_none_or(|spread| spread <= spread_most)
+                && least_ns.iter().all(|time_ns| *time_ns <= budget_ns)
+        };
+        let again = compute_again(self.setup, &run.tape, run.cycles.len(), settled, self.stop)?;
+        let Some(again) = again else { return Ok(None) };
+        if again.different > 0 {
+            let what = "cycles computed again gave other commands: what the witness cannot prove counts as the software's";
+            self.warn("again", &[what.to_owned()]);
+        }
+        Ok(Some(loop_figures(self.scenario(), &run, load, &again)))
+    }
+}
+
+/// A loop that has run.
+#[derive(Debug)]
+pub struct LoopDone {
+    run: LoopRun,
+    load: Option<LoadDone>,
+}
+
+/// Time a cycle may compute (ns).
+fn budget_ns(scenario: &Scenario) -> u64 {
+    ns(scenario.timing.compute_budget / scenario.controller.mpc_rate_hz)
+}
+
+/// 99.9 % over the median.
+fn spread(times: &Times) -> Option<f64> {
+    times.at_ns(0.999).zip(times.at_ns(0.5)).map(|(high, median)| high as f64 / median as f64)
 }
 
 /// Settings without any privilege.
@@ -278,12 +337,14 @@ fn floor_figures(
     }
 }
 
-fn loop_figures(scenario: &Scenario, run: &LoopRun, load: Option<LoadDone>) -> LoopFigures {
+fn loop_figures(scenario: &Scenario, run: &LoopRun, load: Option<LoadDone>, again: &Again) -> LoopFigures {
     let [plant_core, controller_core] = cores_of(scenario);
     let period_ns = ns(1.0 / scenario.controller.mpc_rate_hz);
     let event_ns = ns(scenario.timing.event_s);
     let witness = run.witnesses.iter().find(|(core, witness)| *core == controller_core && witness.realtime);
     let stalled = witness.map(|(_, witness)| stalls(&witness.ticks, event_ns)).unwrap_or_default();
+    // A tape that ran out of room does not have the last cycles.
+    let valid = again.different == 0 && again.least_ns.len() == run.cycles.len();
     let evidence = Evidence {
         steps: &run.steps,
         witness: witness.map_or_else(Witness::default, |(_, run)| Witness {
@@ -293,8 +354,9 @@ fn loop_figures(scenario: &Scenario, run: &LoopRun, load: Option<LoadDone>) -> L
         }),
         one_core: plant_core == controller_core,
         period_ns,
-        budget_ns: (scenario.timing.compute_budget * period_ns as f64) as u64,
+        budget_ns: budget_ns(scenario),
         event_ns,
+        again_ns: valid.then_some(&again.least_ns[..]),
     };
     let accounts = accounts(&run.cycles, &evidence);
     let mut misses = misses(&run.cycles, &accounts, &evidence);
@@ -303,9 +365,9 @@ fn loop_figures(scenario: &Scenario, run: &LoopRun, load: Option<LoadDone>) -> L
     });
     misses.truncate(MISSES_KEPT);
     let disturbed = |account: &&Account| account.is_disturbed(event_ns);
-    let undisturbed = accounts.iter().filter(|account| !disturbed(account));
-    let calm = Times::of(undisturbed.map(Account::computing_ns));
-    let spread = calm.at_ns(0.999).zip(calm.at_ns(0.5)).map(|(high, median)| high as f64 / median as f64);
+    let calm = accounts.iter().filter(|account| !account.is_seen_disturbed(event_ns));
+    let spread_seen = spread(&Times::of(calm.map(Account::computing_ns)));
+    let of_itself = Times::of(accounts.iter().map(Account::software_ns));
     let (plant, controller) = (run.summary.plant.as_ref(), run.summary.controller.as_ref());
     LoopFigures {
         loaded: load.is_some(),
@@ -337,7 +399,18 @@ fn loop_figures(scenario: &Scenario, run: &LoopRun, load: Option<LoadDone>) -> L
             })
             .collect(),
         disturbed_cycles: accounts.iter().filter(disturbed).count() as u64,
-        compute_spread: spread,
+        compute_spread: if valid { spread(&of_itself) } else { spread_seen },
+        compute_spread_seen: spread_seen,
+        again: (!again.least_ns.is_empty()).then(|| AgainFigures {
+            passes: again.passes,
+            different: again.different,
+            least: Quantity::of(
+                "cycle_software",
+                "controller: whole cycle, computed again, least",
+                &of_itself,
+            ),
+            software_share_of_jitter: software_share_of_jitter(&accounts, of_itself.at_ns(0.5).unwrap_or(0)),
+        }),
         longest_undisturbed: longest_undisturbed(&run.cycles, &accounts, &evidence, LONGEST_KEPT),
         own_time_max_s: accounts.iter().map(Account::own_ns).max().unwrap_or(0) as f64 * 1e-9,
         deadlines: run.cycles.iter().map(|cycle| 1 + u64::from(cycle.missed_ticks)).sum(),
@@ -364,6 +437,13 @@ fn loop_figures(scenario: &Scenario, run: &LoopRun, load: Option<LoadDone>) -> L
         fell: plant.is_none_or(|plant| plant.robot.fell),
         load,
     }
+}
+
+fn software_share_of_jitter(accounts: &[Account], median_ns: u64) -> f64 {
+    let sum = |time: &dyn Fn(&Account) -> u64| accounts.iter().map(time).sum::<u64>() as f64;
+    let software = sum(&|account| account.software_ns().abs_diff(median_ns));
+    let machine = sum(&|account| account.own_ns() - account.software_ns());
+    if software + machine > 0.0 { software / (software + machine) } else { 0.0 }
 }
 
 fn controller_quantities(cycles: &[CycleRecord], accounts: &[Account], period_ns: u64) -> Vec<Quantity> {

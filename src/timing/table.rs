@@ -81,7 +81,8 @@ fn one_loop(text: &mut String, figures: &LoopFigures) {
     if let Some(fault) = &figures.fault {
         let _ = writeln!(text, "  broke off: {fault}");
     }
-    for Quantity { name, figures, .. } in figures.quantities.iter().chain(&figures.witnesses) {
+    let again = figures.again.as_ref().map(|again| &again.least);
+    for Quantity { name, figures, .. } in figures.quantities.iter().chain(again).chain(&figures.witnesses) {
         row(text, name, figures.as_ref());
     }
     let by = Cause::ALL
@@ -99,6 +100,15 @@ fn one_loop(text: &mut String, figures: &LoopFigures) {
         by.join(", ")
     );
     let _ = writeln!(text, "  longest a cycle itself computed: {:.3} ms", 1e3 * figures.own_time_max_s);
+    if let Some(again) = &figures.again {
+        let _ = writeln!(
+            text,
+            "  computed again {} times, {} commands differ: of the jitter of a cycle's own time {:.0} % is the software's",
+            again.passes,
+            again.different,
+            100.0 * again.software_share_of_jitter
+        );
+    }
     for (who, counts) in [("controller", figures.controller_counts), ("plant", figures.plant_counts)] {
         let _ = writeln!(
             text,
@@ -129,9 +139,10 @@ fn one_loop(text: &mut String, figures: &LoopFigures) {
     for long in &figures.longest_undisturbed {
         let _ = writeln!(
             text,
-            "  undisturbed, and long, at {:8.3} s: {:.3} ms, slowness {:.1}, pace {:.1}, QP solves {}; most in {}, {:.3} ms above its median",
+            "  undisturbed, and long, at {:8.3} s: {:.3} ms, again {:.3} ms, slowness {:.1}, pace {:.1}, QP solves {}; most in {}, {:.3} ms above its median",
             long.time_s,
             long.account.computing_ns() as f64 * 1e-6,
+            long.account.software_ns() as f64 * 1e-6,
             long.account.slowness,
             long.account.pace,
             long.qp_solves,
@@ -143,7 +154,7 @@ fn one_loop(text: &mut String, figures: &LoopFigures) {
         let ms = |ns: u64| ns as f64 * 1e-6;
         let _ = write!(
             text,
-            "  missed at {:8.3} s by {:6.3} ms ({} in a row): {}; woken late {:.3}, behind {:.3}, taken {:.3}, own {:.3} ms, slowness {:.1}, pace {:.1}; \
+            "  missed at {:8.3} s by {:6.3} ms ({} in a row): {}; woken late {:.3}, behind {:.3}, taken {:.3}, own {:.3} ms, again {:.3}, slowness {:.1}, pace {:.1}; \
              most in {}",
             miss.time_s,
             1e3 * miss.overrun_s,
@@ -153,6 +164,7 @@ fn one_loop(text: &mut String, figures: &LoopFigures) {
             ms(miss.account.backlog_ns),
             ms(miss.account.taken_ns),
             ms(miss.account.own_ns()),
+            ms(miss.account.software_ns()),
             miss.account.slowness,
             miss.account.pace,
             miss.stage.name()

@@ -22,6 +22,9 @@ use crate::timing::phases::Quantity;
 use crate::timing::raw_flag::RawFlag;
 use crate::verdict::{Ended, Failure};
 
+/// Rounds of all measurements, one after the other, in memory of their own: where a page lies decides how far apart two cores are, and a
+/// machine may change its pace meanwhile.
+const ROUNDS: u32 = 5;
 /// Messages exchanged before the first that counts.
 const WARM_UP: u64 = 1_000;
 /// The peer gives up when it has not been asked for so long (ns).
@@ -73,7 +76,7 @@ pub struct TransportSettings {
     pub cores: [usize; 2],
     /// Priority and memory.
     pub process: ProcessSettings,
-    /// Messages each measurement exchanges.
+    /// Messages each measurement exchanges in a round.
     pub messages: u64,
 }
 
@@ -82,21 +85,40 @@ pub struct TransportSettings {
 /// # Errors
 /// When shared memory or the peer break.
 pub fn measure(settings: &TransportSettings) -> Result<TransportReport, Failure> {
-    let flag = beside_a_peer(settings, "flag", |run| measure_flag(settings, run))?;
-    let (state, state_ways) =
-        beside_a_peer(settings, "state", |run| measure_messages::<PlantState>(settings, run))?;
-    let (command, command_ways) =
-        beside_a_peer(settings, "command", |run| measure_messages::<Command>(settings, run))?;
+    let (mut flag, mut state, mut command) = (Vec::new(), Ways::default(), Ways::default());
+    for _ in 0..ROUNDS {
+        flag.extend(beside_a_peer(settings, "flag", |run| measure_flag(settings, run))?);
+        state.add(beside_a_peer(settings, "state", |run| measure_messages::<PlantState>(settings, run))?);
+        command.add(beside_a_peer(settings, "command", |run| measure_messages::<Command>(settings, run))?);
+    }
+    let flag = Times::of(flag);
+    let [state, state_way, command, command_way] =
+        [state.round_trips, state.back, command.round_trips, command.back].map(Times::of);
     let median = |times: &Times| times.at_ns(0.5).map(|ns| ns as f64);
     let ratio = median(&state).zip(median(&flag)).map(|(state, flag)| state / flag);
     Ok(TransportReport {
         flag_round_trip: Quantity::of("flag_round_trip", "flag in shared memory, round trip: floor", &flag),
         state_round_trip: Quantity::of("state_round_trip", "state and state, round trip", &state),
-        state_one_way: Quantity::of("state_one_way", "state, one way", &state_ways),
+        state_one_way: Quantity::of("state_one_way", "state, one way", &state_way),
         command_round_trip: Quantity::of("command_round_trip", "state and command, round trip", &command),
-        command_one_way: Quantity::of("command_one_way", "command, one way", &command_ways),
+        command_one_way: Quantity::of("command_one_way", "command, one way", &command_way),
         ratio_to_flag: ratio,
     })
+}
+
+/// Times of messages (ns).
+#[derive(Debug, Default)]
+struct Ways {
+    round_trips: Vec<u64>,
+    /// Of the answers.
+    back: Vec<u64>,
+}
+
+impl Ways {
+    fn add(&mut self, other: Self) {
+        self.round_trips.extend(other.round_trips);
+        self.back.extend(other.back);
+    }
 }
 
 /// Starts a peer and does work on a thread of its own; afterwards nothing of their run is left.
@@ -122,7 +144,7 @@ fn take_core(process: &ProcessSettings, core: usize) {
     let _ = prepare(&process, Some(core));
 }
 
-fn measure_flag(settings: &TransportSettings, run: RunId) -> Result<Times, Failure> {
+fn measure_flag(settings: &TransportSettings, run: RunId) -> Result<Vec<u64>, Failure> {
     let flag = RawFlag::create(&flag_path(run)).map_err(Failure::fault)?;
     let mut times = Vec::with_capacity(settings.messages as usize);
     let mut watch = Patience::new();
@@ -143,7 +165,7 @@ fn measure_flag(settings: &TransportSettings, run: RunId) -> Result<Times, Failu
             times.push(monotonic_ns() - begin_ns);
         }
     }
-    Ok(Times::of(times))
+    Ok(times)
 }
 
 /// A look without pause, but for the first answer: the peer is still on its way, and may need our core for it.
@@ -177,13 +199,13 @@ impl Answer for Command {
 }
 
 /// Round trips, and the ways of the answers.
-fn measure_messages<A: Answer>(settings: &TransportSettings, run: RunId) -> Result<(Times, Times), Failure> {
+fn measure_messages<A: Answer>(settings: &TransportSettings, run: RunId) -> Result<Ways, Failure> {
     let node = RunNode::open(run, 0).map_err(Failure::fault)?;
     let mut questions = node.publisher::<PlantState>(Channel::State).map_err(Failure::fault)?;
     let mut answers = node.subscriber::<A>(Channel::Command).map_err(Failure::fault)?;
     let mut state = PlantState::new(run.0, 0, 0);
     let room = settings.messages as usize;
-    let (mut round_trips, mut ways) = (Vec::with_capacity(room), Vec::with_capacity(room));
+    let mut ways = Ways { round_trips: Vec::with_capacity(room), back: Vec::with_capacity(room) };
     let mut watch = Patience::new();
     for number in 1..=WARM_UP + settings.messages {
         state.header.sequence = number;
@@ -207,11 +229,11 @@ fn measure_messages<A: Answer>(settings: &TransportSettings, run: RunId) -> Resu
             take_core(&settings.process, settings.cores[0]);
         }
         if number > WARM_UP {
-            round_trips.push(end_ns - begin_ns);
-            ways.push(end_ns.saturating_sub(answer_sent_ns));
+            ways.round_trips.push(end_ns - begin_ns);
+            ways.back.push(end_ns.saturating_sub(answer_sent_ns));
         }
     }
-    Ok((Times::of(round_trips), Times::of(ways)))
+    Ok(ways)
 }
 
 /// The peer's side.

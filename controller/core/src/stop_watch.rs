@@ -1,6 +1,6 @@
 //! Elapsed time of the steps of a cycle, ns, by a clock of the caller: this crate has none of its own.
 
-/// Tells elapsed time, for the report only.
+/// Tells elapsed time, for the report, and for how far ahead the next cycle has to be prepared.
 pub trait Clock {
     /// Monotonic time, ns.
     fn now_ns(&self) -> u64;

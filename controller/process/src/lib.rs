@@ -4,6 +4,7 @@
 //! |---|---|
 //! | [`clock`] | the machine's monotonic clock, a timer that does not drift |
 //! | [`machine`] | priority, memory and cores asked of the operating system |
+//! | [`awake`] | keeps a core from falling asleep |
 //! | [`presence`] | signs of life, given and followed |
 //! | [`stop`] | signals |
 //! | [`membership`] | the three together: a process's part in a run |
@@ -12,6 +13,7 @@
 //! | [`records`] | every cycle and every plant step with its times, for the timing report |
 //! | [`usage`] | page faults, context switches and CPU time of the calling thread |
 
+pub mod awake;
 pub mod clock;
 pub mod controller_loop;
 pub mod figures;

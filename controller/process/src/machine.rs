@@ -15,15 +15,8 @@ use thread_priority::{
 /// Threads made afterwards inherit core and priority: make helpers before.
 pub fn prepare(settings: &ProcessSettings, core: Option<usize>) -> Vec<String> {
     let mut warnings = Vec::new();
-    if let Some(core) = core {
-        let mut cores = CpuSet::new();
-        let exists = core < CpuSet::MAX_CPU;
-        if exists {
-            cores.set(core);
-        }
-        if !exists || sched_setaffinity(None, &cores).is_err() {
-            warnings.push(format!("core {core} does not exist or is not ours: any core is used"));
-        }
+    if let Some(core) = core.filter(|core| !bind_to_core(*core)) {
+        warnings.push(format!("core {core} does not exist or is not ours: any core is used"));
     }
     if settings.lock_memory {
         // With a limit, a lock that succeeds now would make later allocations fail.
@@ -38,6 +31,16 @@ pub fn prepare(settings: &ProcessSettings, core: Option<usize>) -> Vec<String> {
         warnings.push(message.to_owned());
     }
     warnings
+}
+
+/// Binds the calling thread to a core; says whether that succeeded.
+pub fn bind_to_core(core: usize) -> bool {
+    let mut cores = CpuSet::new();
+    let exists = core < CpuSet::MAX_CPU;
+    if exists {
+        cores.set(core);
+    }
+    exists && sched_setaffinity(None, &cores).is_ok()
 }
 
 /// Whether the calling thread has a real-time priority.

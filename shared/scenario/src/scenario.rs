@@ -204,6 +204,8 @@ pub struct ProcessSettings {
     pub priority: u8,
     /// Whether all memory is kept in RAM.
     pub lock_memory: bool,
+    /// Whether the cores named below are kept from falling asleep between two ticks. Costs power.
+    pub keep_awake: bool,
     /// Core of the plant process; any when not given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub plant_core: Option<usize>,
@@ -283,7 +285,7 @@ pub struct TimingSettings {
     pub event_s: f64,
     /// Time a cycle may compute, as part of its period: a deadline missed by a cycle that computed longer is the software's.
     pub compute_budget: f64,
-    /// Longest 99.9 % of the cycles' computing time over its median, where the machine did not interfere.
+    /// Longest 99.9 % of the cycles' computing time over its median, without what the machine adds to it.
     pub compute_spread: f64,
     /// Largest share of missed deadlines, relative to that of a loop that only burns the same time.
     pub misses_of_floor: f64,
@@ -422,7 +424,14 @@ impl Default for ConstraintSettings {
 
 impl Default for ProcessSettings {
     fn default() -> Self {
-        Self { priority: 50, lock_memory: true, plant_core: None, controller_core: None, hang_s: 2.0 }
+        Self {
+            priority: 50,
+            lock_memory: true,
+            keep_awake: true,
+            plant_core: None,
+            controller_core: None,
+            hang_s: 2.0,
+        }
     }
 }
 

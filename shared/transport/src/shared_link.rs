@@ -1,17 +1,21 @@
 //! The two ends of a channel in shared memory.
 
-use iceoryx2::identifiers::UniquePublisherId;
+use iceoryx2::port::LoanError;
 use iceoryx2::port::publisher::Publisher as PublisherPort;
 use iceoryx2::port::subscriber::Subscriber as SubscriberPort;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::ipc;
 use iceoryx2::sample::Sample;
+use iceoryx2::sample_mut::SampleMut;
 
 use crate::{LinkError, Payload, Publisher, Subscriber};
 
 /// The sending end of a channel; made by [`crate::RunNode::publisher`].
 #[derive(Debug)]
 pub struct SharedPublisher<T: Payload> {
+    /// Memory for the next message, found after the last one was sent, when nobody waits for it any more. Declared before `port`, so that it
+    /// is given back first.
+    next: Option<SampleMut<ipc::Service, T, ()>>,
     port: PublisherPort<ipc::Service, T, ()>,
     channel: &'static str,
 }
@@ -23,35 +27,50 @@ pub struct SharedSubscriber<T: Payload> {
     /// The message given out. Declared before `port`, so that it is given back first.
     held: Option<Sample<ipc::Service, T, ()>>,
     port: SubscriberPort<ipc::Service, T, ()>,
-    /// Who sent the message given out last.
-    origin: Option<UniquePublisherId>,
+    /// Number of the message given out last.
+    sequence: u64,
     channel: &'static str,
 }
 
-/// Messages looked at per call. One is normal, and a publisher has no more than one waiting. Only when it is from another publisher than
-/// the last one may there be two, for one that was started anew: looking again costs as much as the message itself.
+/// Messages looked at per call. A publisher has no more than one waiting; there may be two when one was started anew after the other. Then
+/// the numbers have a gap: only after one is there a second look, for who polls wants an answer at once.
 const MOST_WAITING: usize = 4;
 
 impl<T: Payload> SharedPublisher<T> {
     /// The budget of heap allocations per send, all of it within iceoryx2 0.10: a reference count for the loan of the memory slot, 48
-    /// bytes, freed before the send returns. Its blackboard needs none, but locks out the successor of a killed writer.
+    /// bytes, freed by the next send. Its blackboard needs none, but locks out the successor of a killed writer.
     pub const ALLOCATIONS_PER_SEND: u64 = 1;
 
     pub(crate) fn new(port: PublisherPort<ipc::Service, T, ()>, channel: &'static str) -> Self {
-        Self { port, channel }
+        Self { next: None, port, channel }
+    }
+
+    /// Memory for a message, with the message in it: its cache lines then are this core's.
+    fn loan(&self, message: &T) -> Result<SampleMut<ipc::Service, T, ()>, LoanError> {
+        Ok(self.port.loan_uninit()?.write_payload(*message))
     }
 }
 
 impl<T: Payload> SharedSubscriber<T> {
     pub(crate) fn new(port: SubscriberPort<ipc::Service, T, ()>, channel: &'static str) -> Self {
-        Self { held: None, port, origin: None, channel }
+        Self { held: None, port, sequence: 0, channel }
     }
 }
 
 impl<T: Payload> Publisher<T> for SharedPublisher<T> {
     fn send(&mut self, message: &T) -> Result<(), LinkError> {
-        let sent = self.port.send_copy(*message);
-        sent.map(|_receivers| ()).map_err(|source| LinkError::Send { channel: self.channel, source })
+        let failed = |source| LinkError::Send { channel: self.channel, source };
+        let sample = match self.next.take() {
+            Some(mut sample) => {
+                *sample.payload_mut() = *message;
+                sample
+            }
+            None => self.loan(message).map_err(|source| failed(source.into()))?,
+        };
+        sample.send().map_err(failed)?;
+        // What fails now is tried again, and told, when it is needed.
+        self.next = self.loan(message).ok();
+        Ok(())
     }
 
     fn serve_newcomers(&mut self) -> Result<(), LinkError> {
@@ -66,11 +85,11 @@ impl<T: Payload> Subscriber<T> for SharedSubscriber<T> {
             let received = self.port.receive();
             match received.map_err(|source| LinkError::Receive { channel: self.channel, source })? {
                 Some(sample) => {
-                    let origin = Some(sample.header().publisher_id());
-                    let same = self.origin == origin;
-                    self.origin = origin;
+                    let sequence = sample.payload().header().sequence;
+                    let next = sequence == self.sequence.wrapping_add(1);
+                    self.sequence = sequence;
                     self.held = Some(sample);
-                    if same {
+                    if next {
                         break;
                     }
                 }
