@@ -39,6 +39,13 @@ fn a_report_says_what_was_kept_and_the_exit_status_too() {
         assert!(cycles > 10);
         let missed: u64 = figures["missed_by"].as_array().unwrap().iter().map(|n| n.as_u64().unwrap()).sum();
         assert_eq!(figures["missed"], missed);
+        let again = &figures["again"];
+        assert!(
+            again["passes"].as_u64().unwrap() >= 2,
+            "the cycles come out the same again: {}",
+            report["warnings"]
+        );
+        assert_eq!(again["least"]["figures"]["count"].as_u64().unwrap(), cycles);
         for quantity in figures["quantities"].as_array().unwrap() {
             let (count, bars) = (quantity["figures"]["count"].as_u64(), quantity["bars"].as_array().unwrap());
             let in_bars: u64 = bars.iter().map(|bar| bar["count"].as_u64().unwrap()).sum();

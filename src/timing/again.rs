@@ -46,7 +46,7 @@ pub struct Tape {
 pub struct Again {
     /// Times the tape was gone over.
     pub passes: u32,
-    /// Commands that came out differently, of all passes: then the times say nothing.
+    /// Commands that came out differently: then the times say nothing.
     pub different: u64,
     /// Least time of each cycle with the preparation of the next one (ns).
     pub least_ns: Vec<u64>,

@@ -87,14 +87,15 @@ pub struct LoopFigures {
     pub quantities: Vec<Quantity>,
     /// Wake-up latency of the witnesses of each core, and the time of their fixed work.
     pub witnesses: Vec<Quantity>,
-    /// Cycles in which the machine took the core for `event_s` or more, woke the thread up that late, or was slow.
+    /// Cycles in which the machine took the core for `event_s` or more, woke the thread up that late, or was slow, also when only the same cycle
+    /// again shows it.
     pub disturbed_cycles: u64,
     /// 99.9 % over the median of the time that cycles take of themselves: of those computed again the least, otherwise of those in which the
     /// machine did not visibly interfere.
     pub compute_spread: Option<f64>,
     /// The same of the times of this run alone, in cycles in which the machine did not visibly interfere.
     pub compute_spread_seen: Option<f64>,
-    /// The cycles computed again; nothing when that was not possible.
+    /// The cycles computed again; nothing when they did not come out the same.
     pub again: Option<AgainFigures>,
     /// The longest of these.
     pub longest_undisturbed: Vec<LongCycle>,
@@ -131,8 +132,6 @@ pub struct LoopFigures {
 pub struct AgainFigures {
     /// Times all of them were computed.
     pub passes: u32,
-    /// Commands that came out differently; with any, nothing else here says anything.
-    pub different: u64,
     /// Least time of every cycle.
     pub least: Quantity,
     /// Part of the jitter of the computing time that repeats: deviations of the least times from their median, over these and what the run
@@ -280,11 +279,15 @@ impl Phases<'_> {
         };
         let again = compute_again(self.setup, &run.tape, run.cycles.len(), settled, self.stop)?;
         let Some(again) = again else { return Ok(None) };
-        if again.different > 0 {
-            let what = "cycles computed again gave other commands: what the witness cannot prove counts as the software's";
+        // A tape that ran out of room has not the last cycles; one with bad states on purpose has others than the loop received.
+        let fits = run.tape.inputs.last().map(|input| input.state.header.sequence)
+            == run.cycles.last().map(|cycle| cycle.state_sequence);
+        let again = Some(again).filter(|again| fits && again.different == 0);
+        if again.is_none() {
+            let what = "no cycles that gave the same commands: what the witness cannot prove counts as the software's";
             self.warn("again", &[what.to_owned()]);
         }
-        Ok(Some(loop_figures(self.scenario(), &run, load, &again)))
+        Ok(Some(loop_figures(self.scenario(), &run, load, again.as_ref())))
     }
 }
 
@@ -337,14 +340,17 @@ fn floor_figures(
     }
 }
 
-fn loop_figures(scenario: &Scenario, run: &LoopRun, load: Option<LoadDone>, again: &Again) -> LoopFigures {
+fn loop_figures(
+    scenario: &Scenario,
+    run: &LoopRun,
+    load: Option<LoadDone>,
+    again: Option<&Again>,
+) -> LoopFigures {
     let [plant_core, controller_core] = cores_of(scenario);
     let period_ns = ns(1.0 / scenario.controller.mpc_rate_hz);
     let event_ns = ns(scenario.timing.event_s);
     let witness = run.witnesses.iter().find(|(core, witness)| *core == controller_core && witness.realtime);
     let stalled = witness.map(|(_, witness)| stalls(&witness.ticks, event_ns)).unwrap_or_default();
-    // A tape that ran out of room does not have the last cycles.
-    let valid = again.different == 0 && again.least_ns.len() == run.cycles.len();
     let evidence = Evidence {
         steps: &run.steps,
         witness: witness.map_or_else(Witness::default, |(_, run)| Witness {
@@ -356,7 +362,7 @@ fn loop_figures(scenario: &Scenario, run: &LoopRun, load: Option<LoadDone>, agai
         period_ns,
         budget_ns: budget_ns(scenario),
         event_ns,
-        again_ns: valid.then_some(&again.least_ns[..]),
+        again_ns: again.map(|again| &again.least_ns[..]),
     };
     let accounts = accounts(&run.cycles, &evidence);
     let mut misses = misses(&run.cycles, &accounts, &evidence);
@@ -399,11 +405,10 @@ fn loop_figures(scenario: &Scenario, run: &LoopRun, load: Option<LoadDone>, agai
             })
             .collect(),
         disturbed_cycles: accounts.iter().filter(disturbed).count() as u64,
-        compute_spread: if valid { spread(&of_itself) } else { spread_seen },
+        compute_spread: if again.is_some() { spread(&of_itself) } else { spread_seen },
         compute_spread_seen: spread_seen,
-        again: (!again.least_ns.is_empty()).then(|| AgainFigures {
+        again: again.map(|again| AgainFigures {
             passes: again.passes,
-            different: again.different,
             least: Quantity::of(
                 "cycle_software",
                 "controller: whole cycle, computed again, least",
