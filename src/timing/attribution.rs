@@ -152,7 +152,7 @@ pub struct Account {
     pub slowness: f64,
     /// Time of the stages that do the same work every time over its median.
     pub pace: f64,
-    /// Least time the same cycle took when it was computed again, receiving and sending as long as usual; `None`: it was not.
+    /// Least time the same cycle took when it was computed again, receiving and sending as long as usual (ns); `None`: it was not.
     pub again_ns: Option<u64>,
 }
 
@@ -174,7 +174,7 @@ impl Account {
         self.wall_ns.saturating_sub(self.plant_ns)
     }
 
-    /// The least this cycle is known to take: of its own time, and that of the same cycle again.
+    /// The least this cycle is known to take (ns): of its own time, and that of the same cycle again.
     pub fn software_ns(&self) -> u64 {
         self.again_ns.map_or(self.own_ns(), |again_ns| again_ns.min(self.own_ns()))
     }

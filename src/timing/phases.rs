@@ -97,7 +97,7 @@ pub struct LoopFigures {
     pub compute_spread_seen: Option<f64>,
     /// The cycles computed again; nothing when they did not come out the same.
     pub again: Option<AgainFigures>,
-    /// The longest of these.
+    /// The longest cycles that were not disturbed.
     pub longest_undisturbed: Vec<LongCycle>,
     /// The longest a cycle itself computed (s).
     pub own_time_max_s: f64,
@@ -132,7 +132,7 @@ pub struct LoopFigures {
 pub struct AgainFigures {
     /// Times all of them were computed.
     pub passes: u32,
-    /// Least time of every cycle.
+    /// Least time of every cycle (s).
     pub least: Quantity,
     /// Part of the jitter of the computing time that repeats: deviations of the least times from their median, over these and what the run
     /// took above them.
