@@ -73,6 +73,8 @@ impl CycleClock for RewoundClock<'_> {
 #[derive(Debug)]
 pub struct TapedController {
     controller: RobotController<TapedClock>,
+    /// What entered the cycle whose command is being sent.
+    input: Box<CycleInput>,
     inputs: Records<CycleInput>,
 }
 
@@ -88,7 +90,7 @@ impl TapedController {
         let readings = Records::with_capacity(READINGS_PER_CYCLE * cycles);
         let clock = TapedClock { readings: RefCell::new(readings) };
         let controller = RobotController::with_clock(setup, clock)?;
-        Ok(Self { controller, inputs: Records::with_capacity(cycles) })
+        Ok(Self { controller, input: Box::new(CycleInput::zeroed()), inputs: Records::with_capacity(cycles) })
     }
 
     /// How far from the ball the hand ends, as [`RobotController::out_of_reach_m`].
@@ -105,11 +107,14 @@ impl TapedController {
 impl Controller for TapedController {
     fn cycle(&mut self, state: &PlantState, now_ns: u64, command: &mut Command) {
         self.controller.cycle(state, now_ns, command);
-        self.inputs.keep(CycleInput { state: *state, now_ns, command: checksum(command) });
+        (self.input.state, self.input.now_ns) = (*state, now_ns);
     }
 
     fn prepare(&mut self) {
         self.controller.prepare();
+        // Not before the command is sent: its four thousand words take microseconds.
+        self.input.command = checksum(self.controller.core().command());
+        self.inputs.keep(*self.input);
     }
 }
 

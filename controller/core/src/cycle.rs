@@ -271,6 +271,11 @@ impl Controller {
         &self.command
     }
 
+    /// The command of the last cycle.
+    pub fn command(&self) -> &Command {
+        &self.command
+    }
+
     /// The steps of a cycle; an error is a reason code.
     fn attempt(&mut self, state: &PlantState, now_ns: u64, clock: &dyn Clock) -> Result<(), u32> {
         let mut watch = StopWatch::start(clock);
