@@ -58,6 +58,14 @@ pub(crate) trait Simd: Copy {
     fn mul_add(self, a: Self::Lanes, b: Self::Lanes, c: Self::Lanes) -> Self::Lanes;
     /// `c - a b`.
     fn neg_mul_add(self, a: Self::Lanes, b: Self::Lanes, c: Self::Lanes) -> Self::Lanes;
+    /// `(a_0, a_1, b_0, b_1)`.
+    fn low_halves(self, a: Self::Lanes, b: Self::Lanes) -> Self::Lanes;
+    /// `(Σ a, Σ b, Σ c, Σ d)`.
+    fn sums(self, rows: [Self::Lanes; LANES]) -> Self::Lanes;
+    /// `Σ a` in every lane.
+    fn total(self, a: Self::Lanes) -> Self::Lanes;
+    /// Lane 0.
+    fn first(self, a: Self::Lanes) -> f64;
 
     /// How many [`Simd::Wide`] a kernel may take at a time and still find registers for its sums.
     const WIDES: usize;
@@ -190,6 +198,25 @@ impl<S: Simd> Lane<S> {
     pub fn neg_mul_add(self, b: Self, c: Self) -> Self {
         Self { lanes: self.simd.neg_mul_add(self.lanes, b.lanes, c.lanes), ..self }
     }
+    /// `(self_0, self_1, b_0, b_1)`.
+    #[inline(always)]
+    pub fn low_halves(self, b: Self) -> Self {
+        Self { lanes: self.simd.low_halves(self.lanes, b.lanes), ..self }
+    }
+    /// The sum over the lanes of each.
+    #[inline(always)]
+    pub fn sums([a, b, c, d]: [Self; LANES]) -> Self {
+        Self { lanes: a.simd.sums([a.lanes, b.lanes, c.lanes, d.lanes]), ..a }
+    }
+    /// The sum over the lanes, in all of them.
+    #[inline(always)]
+    pub fn total(self) -> Self {
+        Self { lanes: self.simd.total(self.lanes), ..self }
+    }
+    #[inline(always)]
+    pub fn first(self) -> f64 {
+        self.simd.first(self.lanes)
+    }
 }
 
 impl<S: Simd> Add for Lane<S> {
@@ -278,12 +305,15 @@ mod tests {
 
     struct Sum<'a>(&'a [Quad; 2]);
     impl Kernel for Sum<'_> {
-        type Output = [Quad; 3];
+        type Output = [Quad; 6];
         #[inline(always)]
-        fn run<S: Simd>(self, simd: S) -> [Quad; 3] {
+        fn run<S: Simd>(self, simd: S) -> [Quad; 6] {
             let [a, b] = load(simd, self.0);
             let c = cross([a, b, a], [b, a, b]);
-            [a.mul_add(b, -a).quad(), (a - b).quad(), c[0].quad()]
+            let [a_b, sums] = [a.low_halves(b).quad(), Lane::sums([a, b, a + b, -a]).quad()];
+            let total = a.total().quad();
+            assert_eq!(a.first(), self.0[0].0[0]);
+            [a.mul_add(b, -a).quad(), (a - b).quad(), c[0].quad(), a_b, sums, total]
         }
     }
 
@@ -292,6 +322,9 @@ mod tests {
         let quads = [Quad([1.0, 2.0, -3.0, 0.5]), Quad([4.0, 0.25, 2.0, 8.0])];
         let best = Instructions::detect().unwrap().dispatch(Sum(&quads));
         assert_eq!(best[0].0, [3.0, -1.5, -3.0, 3.5]);
+        assert_eq!(best[3].0, [1.0, 2.0, 4.0, 0.25]);
+        assert_eq!(best[4].0, [0.5, 14.25, 14.75, -0.5]);
+        assert_eq!(best[5].0, [0.5; 4]);
         #[cfg(any(not(target_arch = "x86_64"), feature = "portable"))]
         assert_eq!(best, Instructions::Portable.dispatch(Sum(&quads)));
     }

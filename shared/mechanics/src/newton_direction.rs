@@ -56,9 +56,9 @@ pub enum NewtonMethod {
 
 /// Root-mean-square depth above which Algorithm B.1 beats the branch LU, for s = 1, 2, 3, 4 and more.
 ///
-/// Measured with `benches/crossover.rs` (Xeon with AVX-512; chains and stars of 8 to 125 links): factor and solve cost the same at depth 5
-/// to 7 for s = 1, 17 to 19 for s = 2, 36 for s = 3 (chains), 12 to 14 for s = 4. Atlas on its foot has 10.6.
-const CROSSOVER_DEPTH: [f64; 4] = [6.0, 18.0, 36.0, 13.0];
+/// Measured with `benches/crossover.rs` (Xeon with AVX-512; chains and stars of 8 to 125 links): factor and solve cost the same below the
+/// least depth tried, 4, for s = 1, at 12 to 15 for s = 2, 33 for s = 3 (chains), 12 to 14 for s = 4. Atlas on its foot has 10.6.
+const CROSSOVER_DEPTH: [f64; 4] = [3.0, 14.0, 33.0, 13.0];
 
 impl NewtonMethod {
     /// The faster one for a tree and a number of unknown nodes, by measured crossover of the depth.

@@ -35,7 +35,7 @@
 //! `D_i` equals the pivot of the leaf-to-root block LU. A floating base is the root with `6 s` columns
 //! ([`crate::floating_base`]); only steps 1-4 and 8-9 apply to it.
 //!
-//! Flops per body for s = 1, 2, 3, 4 (factor and one solve): 1.7k, 6.8k, 17k, 34k.
+//! Flops per body for s = 1, 2, 3, 4 (factor and one solve): 1.6k, 6.8k, 17k, 34k.
 
 use alloc::vec;
 use alloc::vec::Vec;
@@ -54,9 +54,10 @@ mod elimination;
 mod interface;
 mod own_response;
 mod sweeps;
+mod trapezoidal;
 
 use base_root::BaseRoot;
-use elimination::Factor;
+use elimination::{Factor, TurnedLanes};
 use sweeps::{Solve, SolveTransposed};
 
 pub(crate) use elimination::{JointNodes, add_scaled, dot};
@@ -74,6 +75,10 @@ pub struct RecursiveNewton {
     /// Transient `Y` matrices, one slot per open branch.
     slots: Vec<Quad>,
     slot_of: Vec<usize>,
+    /// Whether a child's `Ŷ` stands in the slot of the body.
+    has_child: Vec<bool>,
+    /// Of the body at hand, a group each.
+    turned: Vec<TurnedLanes>,
     /// Per body, `s` rows each: `Bᵀ`, `W` (input rows), `Cᵀ`, `Uᵀ` (output rows).
     b: Vec<Quad>,
     w: Vec<Quad>,
@@ -124,6 +129,8 @@ impl RecursiveNewton {
             output_quads,
             slots: vec![Quad::ZERO; slot_count * shape.outputs() * input_quads],
             slot_of,
+            has_child: vec![false; bodies],
+            turned: vec![TurnedLanes::ZERO; del.groups],
             b: vec![Quad::ZERO; bodies * s * input_quads],
             w: vec![Quad::ZERO; bodies * s * input_quads],
             c: vec![Quad::ZERO; bodies * s * output_quads],
@@ -187,7 +194,6 @@ pub(crate) fn assign_slots(tree: &KinematicTree) -> (Vec<usize>, usize) {
 
 impl NewtonDirection for RecursiveNewton {
     fn factor(&mut self, tree: &KinematicTree, del: &DelWorkspace) -> Result<(), FactorError> {
-        self.slots.fill(Quad::ZERO);
         if let Some(responses) = &mut self.responses {
             responses.clear();
         }

@@ -85,6 +85,22 @@ impl Simd for Portable {
     fn neg_mul_add(self, a: [f64; 4], b: [f64; 4], c: [f64; 4]) -> [f64; 4] {
         self.sub(c, self.mul(a, b))
     }
+    #[inline(always)]
+    fn low_halves(self, a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
+        [a[0], a[1], b[0], b[1]]
+    }
+    #[inline(always)]
+    fn sums(self, rows: [[f64; 4]; 4]) -> [f64; 4] {
+        rows.map(|[a, b, c, d]| (a + b) + (c + d))
+    }
+    #[inline(always)]
+    fn total(self, [a, b, c, d]: [f64; 4]) -> [f64; 4] {
+        [(a + c) + (b + d); 4]
+    }
+    #[inline(always)]
+    fn first(self, a: [f64; 4]) -> f64 {
+        a[0]
+    }
 }
 
 /// The operations on four lanes, which AVX2 and AVX-512 share.
@@ -124,6 +140,29 @@ macro_rules! four_lanes_of_pulp {
         #[inline(always)]
         fn neg_mul_add(self, a: pulp::f64x4, b: pulp::f64x4, c: pulp::f64x4) -> pulp::f64x4 {
             self.negate_mul_add_f64x4(a, b, c)
+        }
+        #[inline(always)]
+        fn low_halves(self, a: pulp::f64x4, b: pulp::f64x4) -> pulp::f64x4 {
+            pulp::cast(self.avx._mm256_permute2f128_pd::<0x20>(pulp::cast(a), pulp::cast(b)))
+        }
+        #[inline(always)]
+        fn sums(self, rows: [pulp::f64x4; 4]) -> pulp::f64x4 {
+            let [a, b, c, d] = rows.map(pulp::cast);
+            // (a_0 + a_1, b_0 + b_1, a_2 + a_3, b_2 + b_3), and the same of c and d.
+            let (ab, cd) = (self.avx._mm256_hadd_pd(a, b), self.avx._mm256_hadd_pd(c, d));
+            let low = self.avx._mm256_permute2f128_pd::<0x20>(ab, cd);
+            let high = self.avx._mm256_permute2f128_pd::<0x31>(ab, cd);
+            pulp::cast(self.avx._mm256_add_pd(low, high))
+        }
+        #[inline(always)]
+        fn total(self, a: pulp::f64x4) -> pulp::f64x4 {
+            let a = pulp::cast(a);
+            let halves = self.avx._mm256_add_pd(a, self.avx._mm256_permute2f128_pd::<0x01>(a, a));
+            pulp::cast(self.avx._mm256_add_pd(halves, self.avx._mm256_permute_pd::<0b0101>(halves)))
+        }
+        #[inline(always)]
+        fn first(self, a: pulp::f64x4) -> f64 {
+            a.0
         }
     };
 }

@@ -377,7 +377,7 @@ fn outward<S: Simd, const N: usize>(simd: S, work: &mut AllColumns<'_>, first: u
                 }
             }
             for (k, factors) in rates.chunks_exact(s).enumerate() {
-                let at = shape.nu_at(0) + k;
+                let at = shape.nu_at(0, 0) + k;
                 let mut nu = get(simd, &inputs[from + at]);
                 for gamma in 0..s {
                     nu = mul_add(simd, factors[gamma], x[gamma], nu);

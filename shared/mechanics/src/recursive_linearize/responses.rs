@@ -153,13 +153,14 @@ impl Responses {
         tree: &KinematicTree,
         del: &DelWorkspace,
         i: usize,
-        nodes: &JointNodes,
+        nodes: &JointNodes<'_>,
         factors: &BodyFactors<'_>,
         shape: &Interface,
     ) {
         let (s, ni, no) = (shape.s, shape.inputs(), shape.outputs());
         let (nq, oq) = (ni.div_ceil(LANES), no.div_ceil(LANES));
         let lengths = Lengths::new(shape);
+        let momenta = 6 * (s + 1);
         let rule = &del.rule;
         let constants = &tree.constants()[i];
         let row = |m: &'_ [Quad], quads: usize, r: usize, k: usize| at(&m[r * quads..(r + 1) * quads], k);
@@ -168,8 +169,8 @@ impl Responses {
         let (end_row, end_impulse) = (self.fixed_direction_row(i, s), self.moved_impulse(i, 0));
         // Momentum blocks of C^s; its block DΓ^s is S^s.
         let end_column = |beta: usize, k: usize| {
-            let rate = if beta == s { step(s) * nodes.rate[s][k] } else { 0.0 };
-            rule.weighted_derivative(s, beta) * nodes.twist[beta][k] + rate
+            let rate = if beta == s { step(s) * nodes.rate(s, k) } else { 0.0 };
+            rule.weighted_derivative(s, beta) * nodes.twist(beta, k) + rate
         };
 
         // K^s and b^0, as rows of inputs.
@@ -180,39 +181,39 @@ impl Responses {
         for beta in 0..=s {
             for k in 0..6 {
                 let factor = end_column(beta, k);
-                let source = &factors.y[(shape.momentum_at(beta) + k) * nq..][..nq];
+                let source = &factors.y[shape.momentum_at(beta, k) * nq..][..nq];
                 add_scaled(simd, end, factor, source);
             }
         }
         for k in 0..6 {
             let source = &factors.y[(shape.impulse_at(s) + k) * nq..][..nq];
-            add_scaled(simd, end, nodes.twist[s][k], source);
-            let slot = shape.nu_at(s) + k;
-            end[slot / LANES].0[slot % LANES] -= step(s) * nodes.turned_momentum[s][k];
+            add_scaled(simd, end, nodes.twist(s, k), source);
+            let slot = shape.nu_at(s, k);
+            end[slot / LANES].0[slot % LANES] -= step(s) * nodes.turned_momentum(s, k);
         }
         let moved = &mut moved[..nq];
         let mut set = |k: usize, value: f64| moved[k / LANES].0[k % LANES] = value;
         for k in 0..3 {
-            set(shape.eta_at(0) + k, nodes.twist[0][k]);
+            set(shape.eta_at(0) + k, nodes.twist(0, k));
         }
         for beta in 0..=s {
             for k in 0..6 {
-                let rate = if beta == 0 { nodes.rate[0][k] } else { 0.0 };
-                set(shape.nu_at(beta) + k, slope(beta, 0) * nodes.twist[beta][k] + rate);
+                let rate = if beta == 0 { nodes.rate(0, k) } else { 0.0 };
+                set(shape.nu_at(beta, k), slope(beta, 0) * nodes.twist(beta, k) + rate);
             }
         }
 
         let mut inward = Writer(self.inward[i * lengths.inward..(i + 1) * lengths.inward].iter_mut());
-        for beta in 0..=s {
-            for k in 0..6 {
+        for k in 0..6 {
+            for beta in 0..=s {
                 for alpha in 0..s {
-                    inward.push(row(factors.c, oq, alpha, shape.momentum_at(beta) + k));
+                    inward.push(row(factors.c, oq, alpha, shape.momentum_at(beta, k)));
                 }
                 inward.push(end_column(beta, k));
             }
         }
         for alpha in (1..=s).chain(0..1) {
-            nodes.twist[alpha].iter().for_each(|x| inward.push(*x));
+            (0..6).for_each(|k| inward.push(nodes.twist(alpha, k)));
         }
         factors.inverse.iter().for_each(|x| inward.push(*x));
         for k in 0..no {
@@ -235,14 +236,14 @@ impl Responses {
             value -= step(s) * constants.damping * slope(s, gamma);
             if gamma == s {
                 value -= step(s) * constants.stiffness;
-                value += (0..3).map(|k| end_row[k] * nodes.twist[s][k]).sum::<f64>();
+                value += (0..3).map(|k| end_row[k] * nodes.twist(s, k)).sum::<f64>();
             }
             outward.push(value);
         }
         for gamma in 1..=s {
-            nodes.twist[gamma][..3].iter().for_each(|x| outward.push(*x));
+            (0..3).for_each(|k| outward.push(nodes.twist(gamma, k)));
         }
-        for k in shape.nu_at(0)..ni {
+        for k in shape.nu_at(0, 0)..ni {
             for column in 0..s {
                 outward.push(row(factors.b, nq, column, k));
             }
@@ -257,9 +258,10 @@ impl Responses {
             }
             start.push(g);
         }
-        for k in 0..no {
-            let turned = if k < 6 { nodes.turned_momentum[0][k] } else { 0.0 };
-            start.push(dot(simd, &factors.y[k * nq..(k + 1) * nq], moved) - turned);
+        let first_momentum = |row: usize| row < momenta && row.is_multiple_of(s + 1);
+        for r in 0..no {
+            let turned = if first_momentum(r) { nodes.turned_momentum(0, r / (s + 1)) } else { 0.0 };
+            start.push(dot(simd, &factors.y[r * nq..(r + 1) * nq], moved) - turned);
         }
         end_impulse.iter().for_each(|x| start.push(*x));
         for k in 0..ni {

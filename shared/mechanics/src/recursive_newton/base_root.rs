@@ -171,7 +171,7 @@ impl BaseNodes {
                     let column = self.twist[beta].column(k) * Self::slope(del, beta, gamma)
                         + self.rate[beta].column(k) * Self::follow(beta, gamma, s);
                     for r in 0..6 {
-                        row[shape.nu_at(beta) + r] = column[r];
+                        row[shape.nu_at(beta, r)] = column[r];
                     }
                 }
             }
@@ -197,7 +197,7 @@ impl BaseNodes {
                     }
                     let column = self.twist[beta].column(k) * factor + self.rate[beta].column(k) * rate;
                     for r in 0..6 {
-                        row[shape.momentum_at(beta) + r] = column[r];
+                        row[shape.momentum_at(beta, r)] = column[r];
                     }
                 }
                 for node in shape.first_impulse..s {
@@ -221,7 +221,7 @@ impl BaseNodes {
             let turned = self.momentum[node].dual_bracket(&twist).to_vector();
             let step = sign * del.rule.weights()[node] * del.time_step;
             for r in 0..6 {
-                k_row[shape.nu_at(node) + r] += step * turned[r];
+                k_row[shape.nu_at(node, r)] += step * turned[r];
             }
         };
         add(alpha, -1.0);

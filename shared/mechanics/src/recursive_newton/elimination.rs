@@ -1,8 +1,9 @@
 //! Steps 2 to 7 of Algorithm B.1: bodies are eliminated from the leaves to the root; letters as in [`super`].
 
 use super::own_response::own_response;
-use super::{Interface, MAX_NODES, RecursiveNewton};
-use crate::del_residual::DelWorkspace;
+use super::trapezoidal::{self, two_slots};
+use super::{Interface, RecursiveNewton};
+use crate::del_residual::{BodyLanes, DelWorkspace};
 use crate::errors::FactorError;
 use crate::lanes::{Kernel, LANES, Lane, Lane6, Quad, Simd, dual_bracket, load, store};
 use crate::lobatto::MAX_UNKNOWN_NODES;
@@ -10,13 +11,41 @@ use crate::recursive_linearize::BodyFactors;
 use crate::small_inverse::invert;
 use crate::tree::{KinematicTree, NO_PARENT};
 
-/// What steps 3 to 6 need of a joint, node by node.
-pub(crate) struct JointNodes {
-    pub twist: [[f64; 6]; MAX_NODES],
-    pub rate: [[f64; 6]; MAX_NODES],
-    /// `ad^D_μ S`, `ad^D_Γ S`.
-    pub turned_momentum: [[f64; 6]; MAX_NODES],
-    pub turned_impulse: [[f64; 6]; MAX_NODES],
+/// `ad^D_μ S`, `ad^D_Γ S` of a joint.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct TurnedLanes {
+    pub momentum: [Quad; 6],
+    pub impulse: [Quad; 6],
+}
+
+impl TurnedLanes {
+    pub const ZERO: Self = Self { momentum: [Quad::ZERO; 6], impulse: [Quad::ZERO; 6] };
+}
+
+/// What steps 3 to 6 need of a joint: component `k` at node `alpha`.
+#[derive(Clone, Copy)]
+pub(crate) struct JointNodes<'a> {
+    bodies: &'a [BodyLanes],
+    turned: &'a [TurnedLanes],
+}
+
+impl JointNodes<'_> {
+    #[inline(always)]
+    pub fn twist(&self, alpha: usize, k: usize) -> f64 {
+        self.bodies[alpha / LANES].joint_twist[k].0[alpha % LANES]
+    }
+    #[inline(always)]
+    pub fn rate(&self, alpha: usize, k: usize) -> f64 {
+        self.bodies[alpha / LANES].joint_twist_rate[k].0[alpha % LANES]
+    }
+    #[inline(always)]
+    pub fn turned_momentum(&self, alpha: usize, k: usize) -> f64 {
+        self.turned[alpha / LANES].momentum[k].0[alpha % LANES]
+    }
+    #[inline(always)]
+    pub fn turned_impulse(&self, alpha: usize, k: usize) -> f64 {
+        self.turned[alpha / LANES].impulse[k].0[alpha % LANES]
+    }
 }
 
 pub(super) struct Factor<'a> {
@@ -29,12 +58,10 @@ impl Kernel for Factor<'_> {
     type Output = Result<(), FactorError>;
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) -> Self::Output {
-        // With constant arguments the loops over nodes and rows unroll (reduced interface: 12, 21 inputs).
+        // With constant arguments the loops over nodes and rows unroll.
         let shape = self.work.shape;
         match (shape.s, shape.eta, shape.whole_step) {
-            (1, 3, false) if S::SPECIALISE => {
-                factor(simd, self, Interface { s: 1, eta: 3, first_impulse: 1, whole_step: false })
-            }
+            (1, 3, false) => trapezoidal::factor(simd, self.tree, self.del, self.work),
             (2, 3, false) if S::SPECIALISE => {
                 factor(simd, self, Interface { s: 2, eta: 3, first_impulse: 1, whole_step: false })
             }
@@ -49,14 +76,34 @@ impl Kernel for Factor<'_> {
 #[inline(always)]
 fn factor<S: Simd>(simd: S, work: Factor<'_>, shape: Interface) -> Result<(), FactorError> {
     let Factor { tree, del, work } = work;
+    let mut turned = core::mem::take(&mut work.turned);
+    let outcome = eliminate_all(simd, tree, del, work, &mut turned, shape);
+    work.turned = turned;
+    outcome
+}
+
+#[inline(always)]
+fn eliminate_all<S: Simd>(
+    simd: S,
+    tree: &KinematicTree,
+    del: &DelWorkspace,
+    work: &mut RecursiveNewton,
+    turned: &mut [TurnedLanes],
+    shape: Interface,
+) -> Result<(), FactorError> {
+    work.has_child.fill(false);
     let input_quads = shape.inputs().div_ceil(LANES);
     let size = shape.outputs() * input_quads;
     for i in (0..tree.body_count()).rev() {
+        if !work.has_child[i] {
+            let start = work.slot_of[i] * size;
+            work.slots[start..start + size].fill(Quad::ZERO);
+        }
         own_response(simd, tree, del, work, i, &shape);
         if tree.is_base(i) {
             continue;
         }
-        let nodes = joint_nodes(simd, del, i);
+        let nodes = joint_nodes(simd, del, i, turned);
         joint_matrices(del, work, i, &nodes, &shape);
         if shape.whole_step
             && let Some(responses) = &mut work.responses
@@ -82,40 +129,32 @@ fn factor<S: Simd>(simd: S, work: Factor<'_>, shape: Interface) -> Result<(), Fa
         let parent = tree.constants()[i].parent;
         let own = work.slot_of[i] * size;
         if parent != NO_PARENT {
-            pass_up(simd, work, i, own, work.slot_of[parent] * size, &shape);
+            let to = work.slot_of[parent] * size;
+            if core::mem::replace(&mut work.has_child[parent], true) {
+                pass_up::<S, true>(simd, work, i, own, to, &shape);
+            } else {
+                pass_up::<S, false>(simd, work, i, own, to, &shape);
+            }
         }
-        work.slots[own..own + size].fill(Quad::ZERO);
     }
     Ok(())
 }
 
+/// Fills `turned` (a quad group each).
 #[inline(always)]
-fn joint_nodes<S: Simd>(simd: S, del: &DelWorkspace, i: usize) -> JointNodes {
-    let mut nodes = JointNodes {
-        twist: [[0.0; 6]; MAX_NODES],
-        rate: [[0.0; 6]; MAX_NODES],
-        turned_momentum: [[0.0; 6]; MAX_NODES],
-        turned_impulse: [[0.0; 6]; MAX_NODES],
-    };
-    for g in 0..del.groups {
-        let body = &del.bodies[i * del.groups + g];
+fn joint_nodes<'a, S: Simd>(
+    simd: S,
+    del: &'a DelWorkspace,
+    i: usize,
+    turned: &'a mut [TurnedLanes],
+) -> JointNodes<'a> {
+    let bodies = &del.bodies[i * del.groups..(i + 1) * del.groups];
+    for (body, turned) in bodies.iter().zip(&mut *turned) {
         let twist: Lane6<S> = load(simd, &body.joint_twist);
-        let turned_momentum = store(dual_bracket(load(simd, &body.momentum), twist));
-        let turned_impulse = store(dual_bracket(load(simd, &body.impulse), twist));
-        for lane in 0..LANES {
-            let alpha = g * LANES + lane;
-            if alpha >= MAX_NODES {
-                break;
-            }
-            for k in 0..6 {
-                nodes.twist[alpha][k] = body.joint_twist[k].0[lane];
-                nodes.rate[alpha][k] = body.joint_twist_rate[k].0[lane];
-                nodes.turned_momentum[alpha][k] = turned_momentum[k].0[lane];
-                nodes.turned_impulse[alpha][k] = turned_impulse[k].0[lane];
-            }
-        }
+        turned.momentum = store(dual_bracket(load(simd, &body.momentum), twist));
+        turned.impulse = store(dual_bracket(load(simd, &body.impulse), twist));
     }
-    nodes
+    JointNodes { bodies, turned }
 }
 
 /// `Bᵀ` and `Cᵀ` of a joint.
@@ -124,7 +163,7 @@ fn joint_matrices(
     del: &DelWorkspace,
     work: &mut RecursiveNewton,
     i: usize,
-    nodes: &JointNodes,
+    nodes: &JointNodes<'_>,
     shape: &Interface,
 ) {
     let s = shape.s;
@@ -138,17 +177,17 @@ fn joint_matrices(
         let gamma = column + 1;
         if gamma < s {
             for k in 0..shape.eta {
-                put(shape.eta_at(gamma) + k, nodes.twist[gamma][k]);
+                put(shape.eta_at(gamma) + k, nodes.twist(gamma, k));
             }
         }
         for beta in 0..=s {
             let slope = rule.derivative(beta, gamma) * inverse_step;
             for k in 0..6 {
-                let mut value = slope * nodes.twist[beta][k];
+                let mut value = slope * nodes.twist(beta, k);
                 if beta == gamma {
-                    value += nodes.rate[beta][k];
+                    value += nodes.rate(beta, k);
                 }
-                put(shape.nu_at(beta) + k, value);
+                put(shape.nu_at(beta, k), value);
             }
         }
         let c = &mut work.c[(i * s + column) * output_quads..][..output_quads];
@@ -159,16 +198,16 @@ fn joint_matrices(
         for beta in 0..=s {
             let factor = rule.weighted_derivative(alpha, beta);
             for k in 0..6 {
-                let mut value = factor * nodes.twist[beta][k];
+                let mut value = factor * nodes.twist(beta, k);
                 if beta == alpha {
-                    value += step * nodes.rate[beta][k];
+                    value += step * nodes.rate(beta, k);
                 }
-                put(shape.momentum_at(beta) + k, value);
+                put(shape.momentum_at(beta, k), value);
             }
         }
         if alpha >= shape.first_impulse {
             for k in 0..6 {
-                put(shape.impulse_at(alpha) + k, nodes.twist[alpha][k]);
+                put(shape.impulse_at(alpha) + k, nodes.twist(alpha, k));
             }
         }
     }
@@ -180,8 +219,7 @@ pub(crate) fn dot<S: Simd>(simd: S, a: &[Quad], b: &[Quad]) -> f64 {
     for (x, y) in a.iter().zip(b) {
         sum = Lane::load(simd, x).mul_add(Lane::load(simd, y), sum);
     }
-    let [a, b, c, d] = sum.quad().0;
-    (a + c) + (b + d)
+    sum.total().first()
 }
 
 /// `target += factor source`.
@@ -201,7 +239,7 @@ fn eliminate<S: Simd>(
     del: &DelWorkspace,
     work: &mut RecursiveNewton,
     i: usize,
-    nodes: &JointNodes,
+    nodes: &JointNodes<'_>,
     shape: &Interface,
 ) -> Result<(), FactorError> {
     let s = shape.s;
@@ -227,9 +265,9 @@ fn eliminate<S: Simd>(
             add_scaled(simd, k, factor, &y[row * input_quads..(row + 1) * input_quads]);
         }
         let step = rule.weights()[alpha] * del.time_step;
-        for (c, turned) in nodes.turned_momentum[alpha].iter().enumerate() {
-            let at = shape.nu_at(alpha) + c;
-            k[at / LANES].0[at % LANES] -= step * turned;
+        for c in 0..6 {
+            let at = shape.nu_at(alpha, c);
+            k[at / LANES].0[at % LANES] -= step * nodes.turned_momentum(alpha, c);
         }
         if shape.whole_step
             && alpha == 0
@@ -267,14 +305,20 @@ fn eliminate<S: Simd>(
         let gamma = column + 1;
         let b = &work.b[(i * s + column) * input_quads..][..input_quads];
         let u = &mut work.u[(i * s + column) * output_quads..][..output_quads];
-        for row in 0..outputs {
-            u[row / LANES].0[row % LANES] = dot(simd, &y[row * input_quads..(row + 1) * input_quads], b);
+        for (rows, u) in y.chunks(LANES * input_quads).zip(&mut *u) {
+            let mut sums = [Lane::splat(simd, 0.0); LANES];
+            for (row, sum) in rows.chunks_exact(input_quads).zip(&mut sums) {
+                for (y, b) in row.iter().zip(b) {
+                    *sum = Lane::load(simd, y).mul_add(Lane::load(simd, b), *sum);
+                }
+            }
+            *u = Lane::sums(sums).quad();
         }
         let mut subtract = |at: usize, value: f64| u[at / LANES].0[at % LANES] -= value;
         for k in 0..6 {
-            subtract(shape.momentum_at(gamma) + k, nodes.turned_momentum[gamma][k]);
+            subtract(shape.momentum_at(gamma, k), nodes.turned_momentum(gamma, k));
             if gamma < s {
-                subtract(shape.impulse_at(gamma) + k, nodes.turned_impulse[gamma][k]);
+                subtract(shape.impulse_at(gamma) + k, nodes.turned_impulse(gamma, k));
             }
         }
         if shape.whole_step
@@ -296,9 +340,9 @@ fn eliminate<S: Simd>(
     Ok(())
 }
 
-/// Step 7: `Y_par += Y_i - U_i W_i`.
+/// Step 7: `Y_par += Y_i - U_i W_i`; the first child of its parent (`ADD` false) overwrites what an earlier use has left.
 #[inline(always)]
-fn pass_up<S: Simd>(
+fn pass_up<S: Simd, const ADD: bool>(
     simd: S,
     work: &mut RecursiveNewton,
     i: usize,
@@ -310,20 +354,18 @@ fn pass_up<S: Simd>(
     let outputs = shape.outputs();
     let (input_quads, output_quads) = (shape.inputs().div_ceil(LANES), outputs.div_ceil(LANES));
     let size = outputs * input_quads;
-    let (source, target) = if own < parent {
-        let (low, high) = work.slots.split_at_mut(parent);
-        (&low[own..own + size], &mut high[..size])
-    } else {
-        let (low, high) = work.slots.split_at_mut(own);
-        (&high[..size], &mut low[parent..parent + size])
-    };
+    let (source, target) = two_slots(&mut work.slots, own, parent);
+    let (source, target) = (&source[..size], &mut target[..size]);
     let w = &work.w[i * s * input_quads..(i + 1) * s * input_quads];
     let u = &work.u[i * s * output_quads..(i + 1) * s * output_quads];
     for row in 0..outputs {
         let from = &source[row * input_quads..(row + 1) * input_quads];
         let to = &mut target[row * input_quads..(row + 1) * input_quads];
         for q in 0..input_quads {
-            let mut sum = Lane::load(simd, &to[q]) + Lane::load(simd, &from[q]);
+            let mut sum = Lane::load(simd, &from[q]);
+            if ADD {
+                sum = sum + Lane::load(simd, &to[q]);
+            }
             for k in 0..s {
                 let factor = Lane::splat(simd, u[k * output_quads + row / LANES].0[row % LANES]);
                 sum = factor.neg_mul_add(Lane::load(simd, &w[k * input_quads + q]), sum);

@@ -34,13 +34,15 @@ impl Interface {
     pub fn eta_at(&self, gamma: usize) -> usize {
         self.eta * (gamma - self.first_eta())
     }
+    /// Component `k` of `ν^β`. Components are outermost: a component at all nodes stands together, as in the lanes of Algorithm 1.
     #[inline(always)]
-    pub fn nu_at(&self, beta: usize) -> usize {
-        self.eta * (self.s - self.first_eta()) + 6 * beta
+    pub fn nu_at(&self, beta: usize, k: usize) -> usize {
+        self.eta * (self.s - self.first_eta()) + k * (self.s + 1) + beta
     }
+    /// Component `k` of `Dμ^β`, in the order of `ν`.
     #[inline(always)]
-    pub fn momentum_at(&self, beta: usize) -> usize {
-        6 * beta
+    pub fn momentum_at(&self, beta: usize, k: usize) -> usize {
+        k * (self.s + 1) + beta
     }
     #[inline(always)]
     pub fn impulse_at(&self, alpha: usize) -> usize {

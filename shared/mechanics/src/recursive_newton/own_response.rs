@@ -37,20 +37,22 @@ pub(super) fn own_response<S: Simd>(
             if alpha > shape.s {
                 break;
             }
-            let (row, column) = (shape.momentum_at(alpha), shape.nu_at(alpha));
             let h = h.map(|q| q.0[lane]);
             let j = j.map(|q| q.0[lane]);
             let inertia = [[j[0], j[3], j[4]], [j[3], j[1], j[5]], [j[4], j[5], j[2]]];
             let cross = [[0.0, -h[2], h[1]], [h[2], 0.0, -h[0]], [-h[1], h[0], 0.0]];
+            let mut own = |r: usize, c: usize, value: f64| {
+                put(shape.momentum_at(alpha, r), shape.nu_at(alpha, c), value)
+            };
             for r in 0..3 {
                 for c in 0..3 {
-                    put(row + r, column + c, inertia[r][c]);
+                    own(r, c, inertia[r][c]);
                     if r != c {
-                        put(row + r, column + 3 + c, cross[r][c]);
-                        put(row + 3 + r, column + c, -cross[r][c]);
+                        own(r, 3 + c, cross[r][c]);
+                        own(3 + r, c, -cross[r][c]);
                     }
                 }
-                put(row + 3 + r, column + 3 + r, constants.mass);
+                own(3 + r, 3 + r, constants.mass);
             }
             if alpha >= 1 && alpha < shape.s {
                 let step = del.weights[g].0[lane];
@@ -84,7 +86,7 @@ pub(super) fn own_response<S: Simd>(
         for r in 0..6 {
             for c in 0..6 {
                 let at = 6 * r + c;
-                put(shape.impulse_at(alpha) + r, shape.nu_at(alpha) + c, step * gain.nu[at].0[lane]);
+                put(shape.impulse_at(alpha) + r, shape.nu_at(alpha, c), step * gain.nu[at].0[lane]);
                 if alpha >= 1 {
                     put(shape.impulse_at(alpha) + r, shape.eta_at(alpha) + c, step * gain.eta[at].0[lane]);
                 }
