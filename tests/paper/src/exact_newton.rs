@@ -13,13 +13,14 @@
 //! 0.88, 0.43, 0.21; continuation in the time step 0.97, 0.66, 0.38 at up to nine times the time; every angle limited by itself 0.90,
 //! 0.53, 0.25; plain from a Runge-Kutta step 0.87, 0.45, 0.21.
 //!
-//! `J` is factorised in the first iteration, and again when the change was limited or did not become three times smaller; in between
-//! [`delmpc_mechanics::broyden`] makes the best of the factors, as in the integrator. The plain method and the second attempt factorise always.
+//! `J` is factorised anew where its factors would not do: where the change was limited, and where the contraction of the last iteration, once
+//! more, would not reach the tolerance. In between [`delmpc_mechanics::broyden`] makes the best of the factors, as in the integrator.
+//! The plain method and the second attempt factorise always.
 
 use delmpc_mechanics::broyden::Broyden;
 use delmpc_mechanics::newton_direction::{NewtonDirection, NewtonMethod, NewtonSolver};
 
-use crate::one_step::{OneStep, Outcome, Progress};
+use crate::one_step::{OneStep, Outcome, Progress, TOLERANCE};
 
 /// Iterations of the limited method from the start.
 const MAX_ITERATIONS: usize = 60;
@@ -30,8 +31,8 @@ const MAX_ITERATIONS_AGAIN: usize = 30;
 const MAX_PLAIN_ITERATIONS: usize = 30;
 /// rad; best of 0.15, 0.2, 0.3, 0.4, 0.5.
 pub const CHANGE_LIMIT: f64 = 0.3;
-/// Contraction below which the factors are kept; from 0.1 to 0.6 it makes little difference.
-const KEEP: f64 = 0.3;
+/// N m s: the residual to be expected at which the factors are kept; with Broyden's method ten times the tolerance is as good as the tolerance.
+const KEEP: f64 = 10.0 * TOLERANCE;
 
 /// Workspace of the method with one factorisation.
 #[derive(Clone, Debug)]
@@ -84,27 +85,28 @@ impl ExactNewton {
     /// `thrifty`: keeps factors where it may; otherwise every iteration has its own.
     fn iterate(&mut self, problem: &mut OneStep, before: usize, most: usize, thrifty: bool) -> Outcome {
         let mut last = f64::INFINITY;
-        let mut keep = false;
+        let mut limited = true;
         for iteration in 0..most {
             match problem.evaluate() {
                 Progress::Root => return problem.accept(before + iteration),
                 Progress::Lost => return Outcome::Failed,
                 Progress::Open => {}
             }
-            if !keep {
+            let size = problem.residual_size;
+            if !thrifty || limited || size * (size / last) > KEEP {
                 if self.solver.factor(&problem.tree, &problem.del).is_err() {
                     return Outcome::Failed;
                 }
                 self.broyden.forget();
             }
+            last = size;
             for (x, r) in self.change.iter_mut().zip(&problem.residual) {
                 *x = -r;
             }
             self.solver.solve(&problem.tree, &mut self.change);
             self.broyden.improve(&mut self.change);
             let largest = self.change.iter().fold(0.0f64, |m, x| m.max(x.abs()));
-            keep = thrifty && largest < self.limit && (iteration == 0 || largest < KEEP * last);
-            last = largest;
+            limited = largest > self.limit;
             problem.step((self.limit / largest).min(1.0), &self.change);
         }
         Outcome::Failed

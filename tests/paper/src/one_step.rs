@@ -52,6 +52,8 @@ pub struct OneStep {
     pub del: DelWorkspace,
     /// `r`, valid after [`Self::evaluate`].
     pub residual: Vec<f64>,
+    /// `|r|_2`, likewise.
+    pub residual_size: f64,
     start: Vec<f64>,
     rate: Vec<f64>,
     guess: Vec<f64>,
@@ -72,6 +74,7 @@ impl OneStep {
             tree: tree.clone(),
             del,
             residual: vec![0.0; n],
+            residual_size: 0.0,
             start: vec![0.0; n],
             rate: vec![0.0; n],
             guess: vec![0.0; n],
@@ -138,10 +141,10 @@ impl OneStep {
     pub fn evaluate(&mut self) -> Progress {
         self.del.evaluate(&self.tree, &[]);
         self.del.residual_into(&self.tree, &mut self.residual);
-        let square: f64 = self.residual.iter().map(|r| r * r).sum();
-        if square <= TOLERANCE * TOLERANCE {
+        self.residual_size = self.residual.iter().map(|r| r * r).sum::<f64>().sqrt();
+        if self.residual_size <= TOLERANCE {
             Progress::Root
-        } else if square < DIVERGED * DIVERGED {
+        } else if self.residual_size < DIVERGED {
             Progress::Open
         } else {
             Progress::Lost
