@@ -2,14 +2,23 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod oracle;
+mod random_tree;
 
 use delmpc_mechanics::branch_lu::BranchLu;
 use delmpc_mechanics::del_hessian::DelHessian;
+use delmpc_mechanics::del_residual::{DelWorkspace, ForceCapacity};
+use delmpc_mechanics::dense_lu::DenseNewton;
+use delmpc_mechanics::forces::StepForces;
+use delmpc_mechanics::lobatto::LobattoRule;
 use delmpc_mechanics::newton_direction::{NewtonDirection, NewtonMethod, NewtonSolver};
 use delmpc_mechanics::recursive_newton::RecursiveNewton;
 use delmpc_mechanics::row_matrix::RowMatrix;
+use delmpc_mechanics::state::State;
 use delmpc_mechanics::tangent::TangentWorkspace;
+use delmpc_mechanics::tree::{Base, Body, KinematicTree, TreeBuilder};
 use oracle::{assert_close, flat, unconstrained};
+use proptest::prelude::*;
+use random_tree::{Random, difference, multiply, size};
 
 const METHODS: [NewtonMethod; 3] = [NewtonMethod::Dense, NewtonMethod::BranchLu, NewtonMethod::Recursive];
 
@@ -158,6 +167,67 @@ fn pivots_of_the_recursion_are_those_of_the_branch_lu() {
             let tolerance = if case.tree.dof() >= 30 { 1e-7 } else { 1e-9 };
             let dof = case.tree.joint_dof(body);
             assert_close(&name, recursive.inverse_pivot(body), lu.inverse_pivot(dof), tolerance);
+        }
+    }
+}
+
+/// The tree with what acts on its bodies from outside, gravity excepted, taken away.
+fn without_drag(tree: &KinematicTree) -> KinematicTree {
+    let mut bodies = tree.bodies().iter();
+    let mut builder = match tree.base() {
+        Base::Fixed => TreeBuilder::fixed_base(*tree.gravity_w()),
+        Base::Floating => TreeBuilder::floating_base(*tree.gravity_w(), bodies.next().unwrap().inertia),
+    };
+    for body in bodies {
+        builder.add(Body::new(body.parent, body.joint, body.inertia));
+    }
+    builder.build().unwrap()
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+
+    /// Branched trees, springs and damping in the joints, at nodes that solve nothing: `J x = b` and `Jᵀ x = b` against the assembled `J`.
+    #[test]
+    fn every_factorisation_solves_random_trees(
+        seed: u64, joints in 1usize..14, floating: bool, drag: bool, s in 1usize..=3
+    ) {
+        let random = &mut Random::new(seed);
+        let mut tree = random.tree(joints, floating);
+        if !drag {
+            tree = without_drag(&tree);
+        }
+        let rule = LobattoRule::new(s).unwrap();
+        let mut del = DelWorkspace::new(&tree, &rule, 0.01, ForceCapacity::default()).unwrap();
+        let mut state = State::zeros(&tree);
+        state.q = random.values(joints, 1.5);
+        state.p = random.values(tree.dof(), 1.0);
+        state.base_pose = random.pose();
+        let torques = random.values(joints, 5.0);
+        del.begin(&tree, &state, &StepForces::held(&torques)).unwrap();
+        for node in 1..=s {
+            for dof in 0..tree.dof() {
+                del.move_node(node, dof, random.range(-0.02, 0.02));
+            }
+        }
+        del.evaluate(&tree, &[]);
+        let order = s * tree.dof();
+        let matrix = DenseNewton::new(&tree, &del).assemble(&tree, &del).to_vec();
+        let transposed: Vec<f64> = (0..order * order).map(|at| matrix[(at % order) * order + at / order]).collect();
+        let rhs = random.values(order, 1.0);
+        for method in METHODS {
+            let mut solver = NewtonSolver::new(method, &tree, &del);
+            solver.factor(&tree, &del).unwrap();
+            for (matrix, transpose) in [(&matrix, false), (&transposed, true)] {
+                let mut x = rhs.clone();
+                if transpose {
+                    solver.solve_transposed(&tree, &mut x);
+                } else {
+                    solver.solve(&tree, &mut x);
+                }
+                let error = difference(&multiply(matrix, &x), &rhs) / (size(matrix) * size(&x) + 1.0);
+                prop_assert!(error < 1e-11, "{method:?} {transpose}: {error:.1e}");
+            }
         }
     }
 }
