@@ -20,6 +20,7 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use iceoryx2::service::static_config::messaging_pattern::MessagingPattern as StaticPattern;
 
 use crate::abandoned::without_waiting_for_the_lost;
+use crate::shared_link::MOST_BORROWED;
 use crate::{Channel, LinkError, Payload, RunId, SharedPublisher, SharedSubscriber};
 
 const MAX_SUBSCRIBERS: usize = 8;
@@ -126,7 +127,7 @@ impl RunNode {
                 .enable_safe_overflow(true)
                 .history_size(1)
                 .subscriber_max_buffer_size(1)
-                .subscriber_max_borrowed_samples(2) // the message given out and the one being looked at
+                .subscriber_max_borrowed_samples(MOST_BORROWED)
                 .max_publishers(1)
                 .max_subscribers(MAX_SUBSCRIBERS)
                 .max_nodes(MAX_PROCESSES)

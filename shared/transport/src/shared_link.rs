@@ -24,13 +24,21 @@ pub struct SharedPublisher<T: Payload> {
 /// a copy; the sender cannot touch it until the next call.
 #[derive(Debug)]
 pub struct SharedSubscriber<T: Payload> {
-    /// The message given out. Declared before `port`, so that it is given back first.
-    held: Option<Sample<ipc::Service, T, ()>>,
+    /// The messages given out last; the latest is before `next_place`. Declared before `port`, so that they are given back first.
+    held: [Option<Sample<ipc::Service, T, ()>>; RETURNED_TOGETHER],
+    next_place: usize,
     port: SubscriberPort<ipc::Service, T, ()>,
     /// Number of the message given out last.
     sequence: u64,
     channel: &'static str,
 }
+
+/// Messages given back at a time. To give one back is to write where the sender looks before it sends: its next message then waits for that
+/// cache line to come over. Three of four do not.
+const RETURNED_TOGETHER: usize = 4;
+
+/// Messages a subscriber has at most: those not given back yet, and the one being looked at.
+pub(crate) const MOST_BORROWED: usize = RETURNED_TOGETHER + 1;
 
 /// Messages looked at per call. A publisher has no more than one waiting; there may be two when one was started anew after the other. Then
 /// the numbers have a gap: only after one is there a second look, for who polls wants an answer at once.
@@ -53,7 +61,7 @@ impl<T: Payload> SharedPublisher<T> {
 
 impl<T: Payload> SharedSubscriber<T> {
     pub(crate) fn new(port: SubscriberPort<ipc::Service, T, ()>, channel: &'static str) -> Self {
-        Self { held: None, port, sequence: 0, channel }
+        Self { held: [const { None }; RETURNED_TOGETHER], next_place: 0, port, sequence: 0, channel }
     }
 }
 
@@ -80,7 +88,11 @@ impl<T: Payload> Publisher<T> for SharedPublisher<T> {
 
 impl<T: Payload> Subscriber<T> for SharedSubscriber<T> {
     fn receive_latest(&mut self) -> Result<Option<&T>, LinkError> {
-        self.held = None;
+        if self.next_place == RETURNED_TOGETHER {
+            self.held = [const { None }; RETURNED_TOGETHER];
+            self.next_place = 0;
+        }
+        let place = &mut self.held[self.next_place];
         for _ in 0..MOST_WAITING {
             let received = self.port.receive();
             match received.map_err(|source| LinkError::Receive { channel: self.channel, source })? {
@@ -88,7 +100,7 @@ impl<T: Payload> Subscriber<T> for SharedSubscriber<T> {
                     let sequence = sample.payload().header().sequence;
                     let next = sequence == self.sequence.wrapping_add(1);
                     self.sequence = sequence;
-                    self.held = Some(sample);
+                    *place = Some(sample);
                     if next {
                         break;
                     }
@@ -96,6 +108,7 @@ impl<T: Payload> Subscriber<T> for SharedSubscriber<T> {
                 None => break,
             }
         }
-        Ok(self.held.as_ref().map(|sample| sample.payload()))
+        self.next_place += usize::from(place.is_some());
+        Ok(place.as_ref().map(|sample| sample.payload()))
     }
 }

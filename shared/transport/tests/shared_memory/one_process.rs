@@ -61,6 +61,56 @@ fn a_message_given_out_is_not_overwritten_by_later_ones() {
     }
 }
 
+/// A subscriber gives messages back some at a time; whatever it skips in between, the sender never runs out of memory for the next one.
+#[test]
+fn the_latest_message_arrives_however_many_are_skipped() {
+    let run = TestRun::new();
+    let node = RunNode::open(run.0, HASH).unwrap();
+    let mut states = node.publisher::<PlantState>(Channel::State).unwrap();
+    let mut subscribers = [0; 3].map(|_| node.subscriber::<PlantState>(Channel::State).unwrap());
+    let mut sequence = 0;
+    for turn in 0..200 {
+        for _ in 0..=turn % 7 {
+            sequence += 1;
+            states.send(&run.state(sequence)).unwrap();
+        }
+        for (k, subscriber) in subscribers.iter_mut().enumerate() {
+            if turn % (k + 1) == 0 {
+                let given = subscriber.receive_latest().unwrap().unwrap();
+                assert_eq!(bytes_of(given), bytes_of(&run.state(sequence)));
+            }
+        }
+    }
+}
+
+/// Then there is often one more message at the second look.
+#[test]
+fn a_subscriber_keeps_up_with_a_sender_that_never_rests() {
+    const MESSAGES: u64 = 50_000;
+    let run = TestRun::new();
+    let done = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            let node = RunNode::open(run.0, HASH).unwrap();
+            let mut states = node.publisher::<PlantState>(Channel::State).unwrap();
+            for sequence in 1..=MESSAGES {
+                states.send(&run.state(sequence)).unwrap();
+            }
+            serve_until(&mut states, "the other thread", || done.load(Ordering::Acquire));
+        });
+        let node = RunNode::open(run.0, HASH).unwrap();
+        let mut subscriber = node.subscriber::<PlantState>(Channel::State).unwrap();
+        let mut last = 0;
+        while last < MESSAGES {
+            let state = next(&mut subscriber);
+            assert!(state.header.sequence > last, "{} after {last}", state.header.sequence);
+            last = state.header.sequence;
+            assert_eq!(bytes_of(&state), bytes_of(&run.state(last)));
+        }
+        done.store(true, Ordering::Release);
+    });
+}
+
 #[test]
 fn the_order_of_joining_does_not_matter() {
     let run = TestRun::new();
