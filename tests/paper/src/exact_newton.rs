@@ -9,12 +9,12 @@
 //! one of the roots. It costs nothing while changes are small.
 //!
 //! Measured alternatives at 20, 40, 60 ms on the 32-link chain of rods (400 initial conditions, success; as it is now, with 1000, in figure
-//! 1: 0.98, 0.90, 0.75): plain 0.92, 0.53, 0.24; affine-invariant damping (P. Deuflhard, *Newton Methods for Nonlinear Problems*, Springer 2011, NLEQ-ERR)
+//! 1: 0.99, 0.90, 0.75): plain 0.92, 0.53, 0.24; affine-invariant damping (P. Deuflhard, *Newton Methods for Nonlinear Problems*, Springer 2011, NLEQ-ERR)
 //! 0.88, 0.43, 0.21; continuation in the time step 0.97, 0.66, 0.38 at up to nine times the time; every angle limited by itself 0.90,
 //! 0.53, 0.25; plain from a Runge-Kutta step 0.87, 0.45, 0.21.
 //!
 //! `J` is factorised anew where its factors would not do: where the change was limited, and where the contraction of the last iteration, once
-//! more, would not reach the tolerance. In between [`delmpc_mechanics::broyden`] makes the best of the factors, as in the integrator.
+//! more, would not come near the tolerance. In between [`delmpc_mechanics::broyden`] makes the best of the factors, as in the integrator.
 //! The plain method and the second attempt factorise always.
 
 use delmpc_mechanics::broyden::Broyden;

@@ -1,8 +1,7 @@
 //! Steps 2 to 7 of Algorithm B.1: bodies are eliminated from the leaves to the root; letters as in [`super`].
 
 use super::own_response::own_response;
-use super::trapezoidal::{self, two_slots};
-use super::{Interface, RecursiveNewton};
+use super::{Interface, RecursiveNewton, trapezoidal};
 use crate::del_residual::{BodyLanes, DelWorkspace};
 use crate::errors::FactorError;
 use crate::lanes::{Kernel, LANES, Lane, Lane6, Quad, Simd, dual_bracket, load, store};
@@ -338,6 +337,18 @@ fn eliminate<S: Simd>(
         }
     }
     Ok(())
+}
+
+/// The slots from `from` and from `to` on.
+#[inline(always)]
+pub(super) fn two_slots(slots: &mut [Quad], from: usize, to: usize) -> (&[Quad], &mut [Quad]) {
+    if from < to {
+        let (low, high) = slots.split_at_mut(to);
+        (&low[from..], high)
+    } else {
+        let (low, high) = slots.split_at_mut(from);
+        (high, &mut low[to..])
+    }
 }
 
 /// Step 7: `Y_par += Y_i - U_i W_i`; the first child of its parent (`ADD` false) overwrites what an earlier use has left.

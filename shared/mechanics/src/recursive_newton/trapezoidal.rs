@@ -11,6 +11,7 @@
 //! ```
 
 use super::RecursiveNewton;
+use super::elimination::two_slots;
 use crate::del_residual::{BodyLanes, DelWorkspace};
 use crate::errors::FactorError;
 use crate::kinetic_hessian::own_inertia;
@@ -50,9 +51,9 @@ pub(super) fn factor<S: Simd>(
         let (constants, body) = (&tree.constants()[i], &del.bodies[i]);
         let own = own_rows(simd, constants, body);
         let start = work.slot_of[i] * SIZE;
-        let Some(y) = work.slots[start..].first_chunk_mut::<SIZE>() else { continue };
+        let y = &mut work.slots[start..start + SIZE];
         if !work.has_child[i] {
-            *y = [Quad::ZERO; SIZE];
+            y.fill(Quad::ZERO);
         }
         if tree.is_base(i) {
             add_own(simd, &own, y);
@@ -64,8 +65,8 @@ pub(super) fn factor<S: Simd>(
         let [k0, k1, k2] = core::array::from_fn(|q| k[q] + joint.e[q]);
         let [b0, b1, b2] = joint.b;
         let damping = constants.damping * del.rule.derivative(0, 1) / del.time_step;
-        let [x0, x1, x2, x3] = k0.mul_add(b0, k1.mul_add(b1, k2 * b2)).quad().0;
-        let pivot = (x0 + x2) + (x1 + x3) - del.rule.weights()[0] * del.time_step * damping;
+        let product = k0.mul_add(b0, k1.mul_add(b1, k2 * b2)).total().first();
+        let pivot = product - del.rule.weights()[0] * del.time_step * damping;
         let [[inverse]] =
             invert([[pivot]], 1).map_err(|pivot| FactorError::SingularPivot { body: i, pivot })?;
         let scale = Lane::splat(simd, inverse);
@@ -83,7 +84,7 @@ pub(super) fn factor<S: Simd>(
         if constants.parent != NO_PARENT {
             let to = work.slot_of[constants.parent] * SIZE;
             let (from, to) = two_slots(&mut work.slots, start, to);
-            let (Some(from), Some(to)) = (from.first_chunk(), to.first_chunk_mut()) else { continue };
+            let (from, to) = (&from[..SIZE], &mut to[..SIZE]);
             if core::mem::replace(&mut work.has_child[constants.parent], true) {
                 pass_up::<S, true>(simd, from, &u, &w, to);
             } else {
@@ -92,18 +93,6 @@ pub(super) fn factor<S: Simd>(
         }
     }
     Ok(())
-}
-
-/// The slots from `from` and from `to` on.
-#[inline(always)]
-pub(super) fn two_slots(slots: &mut [Quad], from: usize, to: usize) -> (&[Quad], &mut [Quad]) {
-    if from < to {
-        let (low, high) = slots.split_at_mut(to);
-        (&low[from..], high)
-    } else {
-        let (low, high) = slots.split_at_mut(from);
-        (high, &mut low[to..])
-    }
 }
 
 /// `Bᵀ, Cᵀ, E, Pᵀ` of a joint.
@@ -120,15 +109,23 @@ fn joint_rows<S: Simd>(simd: S, del: &DelWorkspace, body: &BodyLanes) -> Joint<S
     let rate: Lane6<S> = load(simd, &body.joint_twist_rate);
     let turned = dual_bracket(load(simd, &body.momentum), twist);
     let zero = Lane::splat(simd, 0.0);
-    let pairs = |lane: &dyn Fn(usize) -> Lane<S>| -> [Lane<S>; QUADS] {
-        [lane(0).low_halves(lane(1)), lane(2).low_halves(lane(3)), lane(4).low_halves(lane(5))]
-    };
-    Joint {
-        b: pairs(&|k| slopes.mul_add(twist[k], at_end * rate[k])),
-        c: pairs(&|k| factors.mul_add(twist[k], start_step * rate[k])).map(Lane::quad),
-        e: pairs(&|k| start_step.neg_mul_add(turned[k], zero)),
-        p: pairs(&|k| at_end * turned[k]),
+    let mut b = twist;
+    let mut c = twist;
+    let mut e = twist;
+    let mut p = twist;
+    for k in 0..6 {
+        b[k] = slopes.mul_add(twist[k], at_end * rate[k]);
+        c[k] = factors.mul_add(twist[k], start_step * rate[k]);
+        e[k] = start_step.neg_mul_add(turned[k], zero);
+        p[k] = at_end * turned[k];
     }
+    Joint { b: pairs(b), c: pairs(c).map(Lane::quad), e: pairs(e), p: pairs(p) }
+}
+
+/// Six components in lanes of nodes as a row of the interface.
+#[inline(always)]
+fn pairs<S: Simd>([a, b, c, d, e, f]: Lane6<S>) -> [Lane<S>; QUADS] {
+    [a.low_halves(b), c.low_halves(d), e.low_halves(f)]
 }
 
 /// `M_i` at both nodes: entry `[r][q]` has `M[r][2q]` and `M[r][2q+1]`, both nodes of each.
@@ -144,7 +141,7 @@ fn own_rows<S: Simd>(simd: S, constants: &BodyConstants, body: &BodyLanes) -> [[
         [-hz, o, hx, o, m, o],
         [hy, -hx, o, o, o, m],
     ];
-    rows.map(|[a, b, c, d, e, f]| [a.low_halves(b), c.low_halves(d), e.low_halves(f)])
+    rows.map(pairs)
 }
 
 /// Lanes of node 0 and of node 1 in a pair of components.
@@ -155,7 +152,7 @@ fn node_masks<S: Simd>(simd: S) -> [Lane<S>; 2] {
 
 /// Step 1 alone.
 #[inline(always)]
-fn add_own<S: Simd>(simd: S, own: &[[Lane<S>; QUADS]; 6], y: &mut [Quad; SIZE]) {
+fn add_own<S: Simd>(simd: S, own: &[[Lane<S>; QUADS]; 6], y: &mut [Quad]) {
     let masks = node_masks(simd);
     for (pair, own) in y.chunks_exact_mut(2 * QUADS).zip(own) {
         for (row, mask) in pair.chunks_exact_mut(QUADS).zip(masks) {
@@ -172,7 +169,7 @@ fn add_own_and_multiply<S: Simd>(
     simd: S,
     own: &[[Lane<S>; QUADS]; 6],
     joint: &Joint<S>,
-    y: &mut [Quad; SIZE],
+    y: &mut [Quad],
 ) -> ([Lane<S>; QUADS], [Lane<S>; QUADS]) {
     let zero = Lane::splat(simd, 0.0);
     let masks = node_masks(simd);
@@ -203,10 +200,10 @@ fn add_own_and_multiply<S: Simd>(
 #[inline(always)]
 fn pass_up<S: Simd, const ADD: bool>(
     simd: S,
-    from: &[Quad; SIZE],
+    from: &[Quad],
     u: &[Quad; QUADS],
     w: &[Lane<S>; QUADS],
-    to: &mut [Quad; SIZE],
+    to: &mut [Quad],
 ) {
     for r in 0..ROWS {
         let u = Lane::splat(simd, u[r / 4].0[r % 4]);
