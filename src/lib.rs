@@ -54,6 +54,7 @@ pub mod setup;
 pub mod simulated_robot;
 pub mod sole;
 pub mod stance;
+pub mod start;
 pub mod status_line;
 pub mod steering;
 pub mod summary;

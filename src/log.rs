@@ -247,19 +247,39 @@ uint64 time_ns
 uint64 applied_command_sequence
 uint32 clock
 uint32 n_joints
-uint32 stance_foot
-uint32 contact_flags
+uint32 n_feet
+uint32 sensors
 uint32 status_flags
 uint32 watchdog_level
 float64[32] position
 float64[32] velocity
 float64[32] applied_torque
+float64[3] imu_angle
+float64[3] imu_velocity
+float64[3] imu_angular_velocity
+float64[3] imu_specific_force
+delmpc_msgs/FootReading[8] feet
 float64[3] base_position_w
 float64[4] base_orientation_w
 float64[3] base_angular_velocity_b
 float64[3] base_linear_velocity_b
-float64[3] stance_torque_b
-float64[3] stance_force_b
+";
+
+const FOOT_READING_FIELDS: &str = "\
+uint32 flags
+uint32 reserved
+float64[3] torque_s
+float64[3] force_s
+";
+
+const STATE_ESTIMATE_FIELDS: &str = "\
+uint32 known
+uint32 feet_loaded
+float64[4] base_orientation_w
+float64[3] base_angular_velocity_b
+float64[3] base_linear_velocity_b
+float64[3] gyro_bias
+float64[3] accelerometer_bias
 ";
 
 const SEGMENT_FIELDS: &str = "\
@@ -270,9 +290,12 @@ float64[32] torque_upper
 float64[32] position_ref
 float64[32] velocity_ref
 float64[32] acceleration_ref
+float64[3] imu_angle_ref
+float64[3] imu_rate_ref
+float64[3] imu_acceleration_ref
 ";
 
-/// The gain is the row-major 32 x 64 matrix.
+/// The gain is the row-major 32 x 64 matrix, that of the inertial unit 32 x 6.
 const COMMAND_FIELDS: &str = "\
 delmpc_msgs/Header header
 uint64 state_sequence
@@ -284,10 +307,17 @@ uint32 verdict
 uint32 fallback_level
 uint32 reason
 uint32 n_segments
-uint32 reserved
+uint32 rate_samples
 delmpc_msgs/Segment[8] segments
 float64[2048] gain
+float64[192] imu_gain
+float64[3] imu_rate_bias
+uint32[32] load_foot
+float64[8] full_load_n
+float64[32] unloaded_stiffness
+float64[32] unloaded_damping
 delmpc_msgs/CycleReport report
+delmpc_msgs/StateEstimate estimate
 ";
 
 const CYCLE_REPORT_FIELDS: &str = "\
@@ -320,6 +350,8 @@ float64[32] velocity
 float64[32] torque
 float64[3] base_position_w
 float64[4] base_orientation_w
+float64[3] base_angular_velocity_b
+float64[3] base_linear_velocity_b
 float64[3] com_w
 float64[3] com_velocity_w
 float64[3] sole_position_w
@@ -344,12 +376,19 @@ float64[3] force_w
 ";
 
 fn plant_state_schema() -> String {
-    format!("{PLANT_STATE_FIELDS}{SEPARATOR}MSG: delmpc_msgs/Header\n{HEADER_FIELDS}")
+    format!(
+        "{PLANT_STATE_FIELDS}{SEPARATOR}MSG: delmpc_msgs/Header\n{HEADER_FIELDS}\
+         {SEPARATOR}MSG: delmpc_msgs/FootReading\n{FOOT_READING_FIELDS}"
+    )
 }
 
 fn command_schema() -> String {
-    let parts =
-        [("Header", HEADER_FIELDS), ("Segment", SEGMENT_FIELDS), ("CycleReport", CYCLE_REPORT_FIELDS)];
+    let parts = [
+        ("Header", HEADER_FIELDS),
+        ("Segment", SEGMENT_FIELDS),
+        ("CycleReport", CYCLE_REPORT_FIELDS),
+        ("StateEstimate", STATE_ESTIMATE_FIELDS),
+    ];
     let part = |(name, fields)| format!("{SEPARATOR}MSG: delmpc_msgs/{name}\n{fields}");
     std::iter::once(COMMAND_FIELDS.to_owned()).chain(parts.map(part)).collect()
 }
@@ -358,6 +397,7 @@ fn command_schema() -> String {
 mod tests {
     use super::*;
     use delmpc_messages::{CycleReport, Header, Segment};
+    use delmpc_messages::{FootReading, StateEstimate};
     use std::mem::offset_of;
 
     /// Offset of every field as CDR lays it out, and the size of the whole.
@@ -376,6 +416,8 @@ mod tests {
                 "delmpc_msgs/Header" => (layout(HEADER_FIELDS).1, 4),
                 "delmpc_msgs/Segment" => (layout(SEGMENT_FIELDS).1, 8),
                 "delmpc_msgs/CycleReport" => (layout(CYCLE_REPORT_FIELDS).1, 8),
+                "delmpc_msgs/FootReading" => (layout(FOOT_READING_FIELDS).1, 8),
+                "delmpc_msgs/StateEstimate" => (layout(STATE_ESTIMATE_FIELDS).1, 8),
                 other => panic!("{other}"),
             };
             offset = offset.next_multiple_of(alignment);
@@ -406,19 +448,22 @@ mod tests {
                 applied_command_sequence,
                 clock,
                 n_joints,
-                stance_foot,
-                contact_flags,
+                n_feet,
+                sensors,
                 status_flags,
                 watchdog_level,
                 position,
                 velocity,
                 applied_torque,
+                imu_angle,
+                imu_velocity,
+                imu_angular_velocity,
+                imu_specific_force,
+                feet,
                 base_position_w,
                 base_orientation_w,
                 base_angular_velocity_b,
                 base_linear_velocity_b,
-                stance_torque_b,
-                stance_force_b,
             ]
         );
         assert_layout!(
@@ -435,16 +480,48 @@ mod tests {
                 fallback_level,
                 reason,
                 n_segments,
-                reserved,
+                rate_samples,
                 segments,
                 gain,
+                imu_gain,
+                imu_rate_bias,
+                load_foot,
+                full_load_n,
+                unloaded_stiffness,
+                unloaded_damping,
                 report,
+                estimate,
             ]
         );
         assert_layout!(
             Segment,
             SEGMENT_FIELDS,
-            [begin_ns, torque, torque_lower, torque_upper, position_ref, velocity_ref, acceleration_ref,]
+            [
+                begin_ns,
+                torque,
+                torque_lower,
+                torque_upper,
+                position_ref,
+                velocity_ref,
+                acceleration_ref,
+                imu_angle_ref,
+                imu_rate_ref,
+                imu_acceleration_ref,
+            ]
+        );
+        assert_layout!(FootReading, FOOT_READING_FIELDS, [flags, reserved, torque_s, force_s]);
+        assert_layout!(
+            StateEstimate,
+            STATE_ESTIMATE_FIELDS,
+            [
+                known,
+                feet_loaded,
+                base_orientation_w,
+                base_angular_velocity_b,
+                base_linear_velocity_b,
+                gyro_bias,
+                accelerometer_bias,
+            ]
         );
         assert_layout!(
             CycleReport,
@@ -483,6 +560,8 @@ mod tests {
                 torque,
                 base_position_w,
                 base_orientation_w,
+                base_angular_velocity_b,
+                base_linear_velocity_b,
                 com_w,
                 com_velocity_w,
                 sole_position_w,

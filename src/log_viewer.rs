@@ -162,8 +162,8 @@ fn robot_scene(setup: &Setup) -> Value {
         };
         entities.push(entity(&format!("{}-{index}", shape.link), frame, 0, [(kind, vec![value])]));
     }
-    if let Some(reach) = &setup.scenario.reach {
-        let place = pose(&RigidTransform::from_translation(reach.ball_m.into()));
+    if let Some(ball_w) = setup.ball_w().ok().flatten() {
+        let place = pose(&RigidTransform::from_translation(ball_w.into()));
         let size = vector(&Vector3::repeat(2.0 * BALL_RADIUS_M));
         let ball = json!({"pose": place, "size": size, "color": {"r": 0.95, "g": 0.76, "b": 0.0, "a": 1.0}});
         entities.push(entity("ball", "world", 0, [("spheres", vec![ball])]));

@@ -1,15 +1,22 @@
 //! The figures of a run, from the truth of every step. The log holds the same records, so anyone can compute them again.
 
-use delmpc_messages::status;
-use delmpc_scenario::Scenario;
+use std::collections::VecDeque;
+
+use delmpc_mechanics::prelude::RigidTransform;
+use delmpc_messages::{Command, status};
+use delmpc_scenario::{Scenario, StartSettings};
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 use crate::truth::Truth;
 
-/// At rest: the mass centre is horizontally this close to where it began (m) ...
+/// At rest: the mass centre is horizontally this close to where it was when the last push began (m) ...
 const REST_DISTANCE_M: f64 = 0.01;
 /// ... and slower than this (m/s).
 const REST_SPEED_M_S: f64 = 0.02;
+
+/// A robot that begins off the ground or leaning has so long to land: tilt and pressure point are judged from then on (s).
+const LANDING_S: f64 = 0.5;
 
 /// Collects the figures step by step. No allocation.
 #[derive(Debug, Clone)]
@@ -18,9 +25,33 @@ pub struct Metrics {
     push_end_s: Option<f64>,
     push_start_s: f64,
     start: Option<Truth>,
+    judged_from_s: f64,
+    /// The mass centre when the last push began (m).
+    before_push: Option<[f64; 3]>,
     /// Last time it was not at rest after the push.
     restless_s: Option<f64>,
     figures: RobotFigures,
+    /// The last truths of the base, for the estimates that come later.
+    recent: VecDeque<BaseTruth>,
+    estimates: EstimateErrors,
+}
+
+/// Steps an estimate may be late.
+const RECENT_STEPS: usize = 256;
+
+#[derive(Debug, Clone, Copy)]
+struct BaseTruth {
+    time_ns: u64,
+    up_b: Vector3<f64>,
+    velocity_b: Vector3<f64>,
+}
+
+/// Sums of squares.
+#[derive(Debug, Clone, Copy, Default)]
+struct EstimateErrors {
+    count: u64,
+    tilt: f64,
+    velocity: f64,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -41,6 +72,9 @@ pub struct RobotFigures {
     pub fell: bool,
     /// When.
     pub fall_time_s: Option<f64>,
+    /// Why, in words.
+    #[serde(default)]
+    pub fall_cause: Option<String>,
     /// Lowest height of the mass centre.
     pub min_com_height_m: Option<f64>,
     /// Whether a foot that was in the air at the start touched the ground.
@@ -68,6 +102,12 @@ pub struct RobotFigures {
     pub settle_time_s: Option<f64>,
     /// Largest change of energy that no work explains, relative.
     pub energy_balance_error: Option<f64>,
+    /// Root mean square of the angle between the vertical and where the controller believed it to be.
+    #[serde(default)]
+    pub estimator_tilt_rms_rad: Option<f64>,
+    /// Root mean square of the error of the base's velocity it believed in.
+    #[serde(default)]
+    pub estimator_velocity_rms_m_s: Option<f64>,
 }
 
 impl Metrics {
@@ -86,12 +126,18 @@ impl Metrics {
             push_start_s: last.map_or(0.0, |push| push.start_s),
             push_end_s: last.map(|push| push.start_s + push.duration_s),
             start: None,
+            judged_from_s: match scenario.robot.start == StartSettings::default() {
+                true => 0.0,
+                false => LANDING_S,
+            },
+            before_push: None,
             restless_s: None,
             figures: RobotFigures {
                 duration_s: 0.0,
                 steps: 0,
                 fell: false,
                 fall_time_s: None,
+                fall_cause: None,
                 min_com_height_m: None,
                 other_foot_touched: false,
                 max_stance_slip_m: 0.0,
@@ -105,13 +151,28 @@ impl Metrics {
                 recovered: None,
                 settle_time_s: None,
                 energy_balance_error: None,
+                estimator_tilt_rms_rad: None,
+                estimator_velocity_rms_m_s: None,
             },
+            recent: VecDeque::with_capacity(RECENT_STEPS),
+            estimates: EstimateErrors::default(),
         }
     }
 
     /// Takes in the initial state (time 0) or the end of a step.
     pub fn observe(&mut self, truth: &Truth) {
         let start = *self.start.get_or_insert(*truth);
+        if self.recent.len() == RECENT_STEPS {
+            self.recent.pop_front();
+        }
+        self.recent.push_back(BaseTruth {
+            time_ns: truth.time_ns,
+            up_b: up_in(&truth.base_orientation_w),
+            velocity_b: truth.base_linear_velocity_b.into(),
+        });
+        if truth.time_s() < self.push_start_s || self.before_push.is_none() {
+            self.before_push = Some(truth.com_w);
+        }
         let figures = &mut self.figures;
         let time_s = truth.time_s();
         figures.duration_s = time_s;
@@ -127,8 +188,10 @@ impl Metrics {
         figures.max_stance_slip_m = figures.max_stance_slip_m.max(slip);
         figures.other_foot_touched |=
             truth.contact_flags & !start.contact_flags != 0 && start.contact_flags != 0;
-        figures.max_stance_tilt_rad = figures.max_stance_tilt_rad.max(truth.sole_tilt_rad);
-        lower(&mut figures.min_cop_margin_m, truth.cop_margin_m);
+        if time_s >= self.judged_from_s {
+            figures.max_stance_tilt_rad = figures.max_stance_tilt_rad.max(truth.sole_tilt_rad);
+            lower(&mut figures.min_cop_margin_m, truth.cop_margin_m);
+        }
         raise(&mut figures.max_friction_use, truth.friction_use);
         figures.max_torque_ratio = figures.max_torque_ratio.max(truth.torque_ratio);
         let torque = &truth.torque[..truth.torque.len().min(truth.n_joints as usize)];
@@ -149,9 +212,39 @@ impl Metrics {
         }
 
         let speed = distance(&truth.com_velocity_w, &[0.0; 3]);
-        let away = horizontal_distance(&truth.com_w, &start.com_w);
+        let away = horizontal_distance(&truth.com_w, &self.before_push.unwrap_or(start.com_w));
         if time_s >= self.push_start_s && (speed > REST_SPEED_M_S || away > REST_DISTANCE_M) {
             self.restless_s = Some(time_s);
+        }
+    }
+
+    /// Ball and start are told in this frame.
+    #[must_use]
+    pub fn in_stance_frame(mut self, stance_frame_w: &RigidTransform) -> Self {
+        if let Some(ball) = &mut self.ball {
+            ball.position_m = stance_frame_w.transform_point(&ball.position_m.into()).into();
+        }
+        self
+    }
+
+    /// Why it fell.
+    pub fn set_fall_cause(&mut self, cause: Option<String>) {
+        self.figures.fall_cause = cause;
+    }
+
+    /// Compares what a controller believed with what was true then. No allocation.
+    pub fn observe_estimate(&mut self, command: &Command) {
+        let estimate = &command.estimate;
+        let time_ns = command.state_time_ns;
+        let then = self.recent.iter().rev().find(|truth| truth.time_ns <= time_ns);
+        let Some(then) = then.filter(|then| estimate.known == 1 && then.time_ns == time_ns) else { return };
+        let up_b = up_in(&estimate.base_orientation_w);
+        let tilt = up_b.cross(&then.up_b).norm().atan2(up_b.dot(&then.up_b));
+        let velocity = (Vector3::from(estimate.base_linear_velocity_b) - then.velocity_b).norm();
+        if tilt.is_finite() && velocity.is_finite() && !self.figures.fell {
+            self.estimates.count += 1;
+            self.estimates.tilt += tilt * tilt;
+            self.estimates.velocity += velocity * velocity;
         }
     }
 
@@ -163,6 +256,9 @@ impl Metrics {
     /// The figures so far.
     pub fn figures(&self) -> RobotFigures {
         let mut figures = self.figures.clone();
+        let rms = |sum: f64| (self.estimates.count > 0).then(|| (sum / self.estimates.count as f64).sqrt());
+        figures.estimator_tilt_rms_rad = rms(self.estimates.tilt);
+        figures.estimator_velocity_rms_m_s = rms(self.estimates.velocity);
         if let Some(push_end_s) = self.push_end_s {
             // At rest at the end, with some time to show that it stays so.
             let restless_s = self.restless_s.unwrap_or(self.push_start_s);
@@ -173,6 +269,12 @@ impl Metrics {
         }
         figures
     }
+}
+
+/// The vertical in the axes of a body with this orientation (x, y, z, w).
+fn up_in(xyzw: &[f64; 4]) -> Vector3<f64> {
+    let [x, y, z, w] = *xyzw;
+    Vector3::new(2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
 }
 
 /// NaN changes nothing.

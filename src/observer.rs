@@ -61,6 +61,8 @@ impl Observer {
         truth.torque[..joints].copy_from_slice(motion.torque);
         truth.base_position_w = motion.base_link_pose_w.translation.into();
         truth.base_orientation_w = quaternion(motion.base_link_pose_w);
+        truth.base_angular_velocity_b = motion.base_twist_b.angular.into();
+        truth.base_linear_velocity_b = motion.base_twist_b.linear.into();
         let loads = motion.torque.iter().zip(&self.effort);
         truth.torque_ratio = loads.map(|(torque, effort)| torque.abs() / effort).fold(0.0, f64::max);
 

@@ -22,6 +22,7 @@ use delmpc_controller_process::figures::percentile;
 use delmpc_controller_process::membership::{Attendance, Order};
 use delmpc_controller_process::records::{Records, StepRecord};
 use delmpc_controller_process::usage::Usage;
+use delmpc_mechanics::prelude::RigidTransform;
 use delmpc_messages::{Command, PlantState, ProcessState, status};
 use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::{LinkError, Publisher, Subscriber};
@@ -54,6 +55,10 @@ pub trait Plant {
     fn pull(&mut self, pull: &Pull);
     /// Fills in what the sensors say now; the loop fills in the header.
     fn measure(&mut self, state: &mut PlantState);
+    /// Why the robot fell, in words, if it did.
+    fn fall_cause(&self) -> Option<String> {
+        None
+    }
     /// Fills in everything that is true now.
     fn truth(&mut self, truth: &mut Truth);
 }
@@ -187,6 +192,13 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
     #[must_use]
     pub fn recording(mut self) -> Self {
         self.records = Records::with_capacity(self.scenario.steps() as usize);
+        self
+    }
+
+    /// Judges ball and pushes in this frame.
+    #[must_use]
+    pub fn in_stance_frame(mut self, stance_frame_w: &RigidTransform) -> Self {
+        self.metrics = self.metrics.in_stance_frame(stance_frame_w);
         self
     }
 
@@ -378,6 +390,7 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
                 self.timing.ages_ns.push(age_ns);
             }
         }
+        self.metrics.observe_estimate(command);
         self.log.command(self.time_ns, command);
         Ok(Some(command.state_sequence))
     }
@@ -398,6 +411,9 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
         self.log.truth(&self.truth);
         self.watchdog_level_max = self.watchdog_level_max.max(self.truth.watchdog_level);
         let fell_s = self.metrics.fall_time_s();
+        if fell_s == Some(self.truth.time_s()) {
+            self.metrics.set_fall_cause(plant.fall_cause());
+        }
         Ok(fell_s.is_none_or(|fell_s| self.truth.time_s() < fell_s + AFTER_FALL_S))
     }
 

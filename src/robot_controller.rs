@@ -3,11 +3,11 @@
 use delmpc_controller_core::config::{ConstraintConfig, ControllerConfig};
 use delmpc_controller_core::cycle::Clock as CycleClock;
 use delmpc_controller_core::prelude as core;
-use delmpc_controller_core::prelude::{
-    BodyPoint, ControllerModel, JointLimits, Reach, StanceObservation, TaskWeights,
-};
+use delmpc_controller_core::prelude::{BodyPoint, ControllerModel, JointLimits, Reach, Sensing, TaskWeights};
 use delmpc_controller_process::clock::monotonic_ns;
 use delmpc_controller_process::controller_loop::Controller;
+use delmpc_estimation::prelude::{EstimatorConfig, EstimatorModel, FootModel};
+use delmpc_mechanics::reroot::Rerooted;
 use delmpc_messages::{Command, PlantState};
 use delmpc_robots::RobotModel;
 use delmpc_scenario::{Clock, ControllerKind, Scenario};
@@ -126,7 +126,51 @@ fn model(setup: &Setup) -> Result<ControllerModel, String> {
         hand: scenario.reach.as_ref().and_then(|reach| point(standing, &reach.hand)),
         swing_foot: other.and_then(|sole| point(standing, &sole.frame)),
         posture: posture.q.clone(),
-        stance: Some(StanceObservation { floating: robot.tree.clone(), rerooted: rooted.rerooted }),
+        sensing: Some(sensing(setup, rooted.rerooted)?),
+    })
+}
+
+/// What the robot feels of its base and feet.
+fn sensing(setup: &Setup, rerooted: Rerooted) -> Result<Sensing, String> {
+    let (robot, scenario) = (&setup.robot, &setup.scenario);
+    let feet: Vec<FootModel> = robot
+        .soles
+        .iter()
+        .map(|sole| {
+            let frame = robot.frame(&sole.frame);
+            let on_body = frame.and_then(|frame| Some((frame.body?, frame.pose)));
+            let (body, sole_pose) = on_body.ok_or_else(|| format!("sole {} is on no link", sole.name))?;
+            let polygon = sole.polygon.iter().map(|corner| (*corner).into()).collect();
+            Ok(FootModel { body, sole: sole_pose, polygon })
+        })
+        .collect::<Result<_, String>>()?;
+    let stance_foot = robot.soles.iter().position(|sole| sole.name == scenario.robot.stance).unwrap_or(0);
+    let (imu_body, imu_mounting) = setup.inertial_unit()?;
+    let s = &scenario.sensors;
+    // Never better than a good sensor, however little noise the scenario has.
+    let scaled = |value: f64, least: f64| (s.noise_scale * value).max(least);
+    let default = EstimatorConfig::default();
+    Ok(Sensing {
+        estimator: EstimatorModel {
+            imu_body,
+            imu_mounting,
+            reference_foot: stance_foot,
+            ..EstimatorModel::new(robot.tree.clone(), feet)
+        },
+        config: EstimatorConfig {
+            sample_s: scenario.plant.step_s,
+            gyro_noise: scaled(s.gyro_noise_rad_s, 1e-4),
+            gyro_bias: scaled(s.gyro_bias_rad_s, 1e-3),
+            gyro_bias_walk: scaled(s.gyro_bias_walk_rad_s, 1e-6),
+            accelerometer_noise: scaled(s.accelerometer_noise_m_s2, 1e-3),
+            accelerometer_bias: scaled(s.accelerometer_bias_m_s2, 1e-3),
+            accelerometer_bias_walk: scaled(s.accelerometer_bias_walk_m_s2, 1e-5),
+            position_noise: scaled(s.position_noise_rad.max(0.3 * s.position_resolution_rad), 1e-6),
+            velocity_noise: scaled(s.velocity_noise_rad_s.max(0.3 * s.velocity_resolution_rad_s), 1e-4),
+            ..default
+        },
+        stance_foot,
+        rerooted,
     })
 }
 

@@ -2,10 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
+use delmpc_mechanics::prelude::RigidTransform;
 use delmpc_messages::{JointSetHasher, MAX_JOINTS, joint_set_hash};
 use delmpc_robots::{RobotModel, load};
 use delmpc_scenario::{Document, Scenario};
 
+use crate::start::Start;
 use crate::verdict::Failure;
 
 /// The scenario that runs when none is named.
@@ -70,6 +72,44 @@ impl Setup {
         texts.fold(JointSetHasher::new(), |hash, text| hash.joint(&text)).finish()
     }
 
+    /// How the robot stands at the start.
+    ///
+    /// # Errors
+    /// [`Failure::Input`] for a posture without base pose.
+    pub fn start(&self) -> Result<Start, Failure> {
+        Start::new(self)
+    }
+
+    /// The ball in the world, m.
+    ///
+    /// # Errors
+    /// As [`Self::start`].
+    pub fn ball_w(&self) -> Result<Option<[f64; 3]>, Failure> {
+        let start = self.start()?;
+        let to_w = |ball_m: [f64; 3]| start.stance_frame_w.transform_point(&ball_m.into()).into();
+        Ok(self.scenario.reach.as_ref().map(|reach| to_w(reach.ball_m)))
+    }
+
+    /// Index of the stance foot among the soles of the robot.
+    pub fn stance_foot(&self) -> usize {
+        self.robot.soles.iter().position(|sole| sole.name == self.scenario.robot.stance).unwrap_or(0)
+    }
+
+    /// Body and mounting of the inertial unit as everybody believes it to be.
+    ///
+    /// # Errors
+    /// When its link is fixed to the world.
+    pub fn inertial_unit(&self) -> Result<(usize, RigidTransform), String> {
+        let sensors = &self.scenario.sensors;
+        let in_link = RigidTransform::from_xyz_rpy(sensors.imu_position_m.into(), sensors.imu_rpy_rad.into());
+        if sensors.imu_link.is_empty() {
+            return Ok((0, in_link));
+        }
+        let link = self.robot.link(&sensors.imu_link);
+        let on_body = link.and_then(|link| Some((link.body?, link.pose * in_link)));
+        on_body.ok_or_else(|| format!("`sensors.imu_link`: {} is fixed to the world", sensors.imu_link))
+    }
+
     /// The frame of the sole the robot stands on.
     pub fn stance_frame(&self) -> &str {
         self.robot.sole(&self.scenario.robot.stance).map_or("", |sole| sole.frame.as_str())
@@ -98,6 +138,13 @@ impl Setup {
         if let Some(reach) = &scenario.reach {
             let frames = robot.frames.iter().map(|frame| frame.name.as_str());
             one_of("reach.hand", "frame or link", &reach.hand, frames.chain(links()))?;
+        }
+        if !scenario.sensors.imu_link.is_empty() {
+            one_of("sensors.imu_link", "link", &scenario.sensors.imu_link, links())?;
+        }
+        for joint in scenario.robot.start.joint_offset.keys() {
+            let known = robot.joint_names.iter().map(String::as_str);
+            one_of("robot.start.joint_offset", "joint", joint, known)?;
         }
         for push in &scenario.push {
             one_of("push.link", "link", &push.link, links())?;

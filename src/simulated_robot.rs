@@ -3,30 +3,25 @@
 use delmpc_mechanics::inverse_dynamics::{InverseDynamicsWorkspace, gravity_force_into};
 use delmpc_mechanics::kinematics::{Configuration, Kinematics};
 use delmpc_mechanics::mass_matrix::{MassMatrixWorkspace, mass_matrix_into};
-use delmpc_mechanics::prelude::State;
+use delmpc_mechanics::prelude::{RigidTransform, State};
 use delmpc_messages::{ClockKind, Command, PlantState};
 use delmpc_plant::prelude as simulation;
 use delmpc_plant::prelude::{
-    ActuatorConfig, ActuatorLimits, ContactPoint, Foot, ModelErrors, MonitorConfig, PlantConfig, PlantModel,
-    SensorConfig, WatchdogConfig,
+    ActuatorConfig, ActuatorLimits, AffineLaw, ContactOptions, ContactPoint, FallCause, Foot, GroundGive,
+    HoldingGains, InertialUnitConfig, ModelErrors, MonitorConfig, PlantConfig, PlantModel, SensorConfig,
+    Terrain, TerrainBox, TerrainGap, WatchdogConfig,
 };
 use delmpc_robots::RobotModel;
-use delmpc_scenario::{Clock, PushSettings, SensorSettings};
+use delmpc_scenario::{Clock, PushSettings, Scenario};
 use nalgebra::Vector3;
 
 use crate::observer::{Motion, Observer};
 use crate::plant_process::Plant;
 use crate::setup::Setup;
+use crate::start::{Start, slope};
 use crate::steering::Pull;
 use crate::truth::Truth;
 use crate::verdict::Failure;
-
-/// Stiffness and damping with which the watchdog holds a posture: every joint as an oscillator of this frequency (rad/s) ...
-const WATCHDOG_FREQUENCY: f64 = 12.0;
-/// ... and this damping ratio, carrying the inertia it has in the posture.
-const WATCHDOG_DAMPING_RATIO: f64 = 0.7;
-/// The robot has fallen when its base is lower than this part of the height at which it began.
-const FALL_HEIGHT: f64 = 0.45;
 
 /// The simulation, and what it takes to tell the truth about it.
 #[derive(Debug)]
@@ -36,6 +31,7 @@ pub struct SimulatedRobot {
     pushes: Vec<simulation::Push>,
     pull_w: Vector3<f64>,
     clock: ClockKind,
+    body_names: Vec<String>,
 }
 
 impl SimulatedRobot {
@@ -46,18 +42,14 @@ impl SimulatedRobot {
     pub fn new(setup: &Setup) -> Result<Self, Failure> {
         let (robot, scenario) = (&setup.robot, &setup.scenario);
         let refused = |error: &dyn std::fmt::Display| Failure::Input(format!("{}: {error}", scenario.name));
-        let posture = robot.posture(&scenario.robot.posture);
-        let standing = posture.and_then(|posture| Some((posture, robot.base_pose_w(posture)?)));
-        let (posture, base_pose) = standing.ok_or_else(|| {
-            refused(&format!("`robot.posture`: the posture {} has no base pose", scenario.robot.posture))
-        })?;
+        let start = setup.start()?;
         let mut state = State::zeros(&robot.tree);
-        state.base_pose = base_pose;
-        state.q.copy_from_slice(&posture.q);
+        state.base_pose = start.base_pose_w;
+        state.q.copy_from_slice(&start.q);
 
-        let holding = Holding::new(setup).map_err(|error| refused(&error))?;
+        let holding = Holding::new(setup, &state).map_err(|error| refused(&error))?;
         let model = model(setup)?;
-        let config = config(setup, &holding, FALL_HEIGHT * base_pose.translation.z)?;
+        let config = config(setup, &holding, &start)?;
         let mut plant = simulation::Plant::new(&model, &config, &state).map_err(|error| refused(&error))?;
         plant.preset_torque(&holding.torque).map_err(|error| refused(&error))?;
         let clock = match scenario.clock {
@@ -70,6 +62,7 @@ impl SimulatedRobot {
             pushes: config.pushes,
             pull_w: Vector3::zeros(),
             clock,
+            body_names: robot.body_names.clone(),
         })
     }
 }
@@ -87,6 +80,19 @@ impl Plant for SimulatedRobot {
         let acts = pull.acts != 0;
         self.pull_w = if acts { pull.force_w.into() } else { Vector3::zeros() };
         self.plant.set_pull(acts.then(|| (pull.body as usize, pull.point_b.into(), self.pull_w)));
+    }
+
+    fn fall_cause(&self) -> Option<String> {
+        let (_, cause) = self.plant.monitor().totals().fall?;
+        Some(match cause {
+            FallCause::MassCentreHeight => "the mass centre came down to half its height".to_owned(),
+            FallCause::BaseTilt => "the base leans more than a radian from its start".to_owned(),
+            FallCause::BodyContact { body } => {
+                format!("{} touched the ground", self.body_names.get(body).map_or("a link", String::as_str))
+            }
+            FallCause::NoStep => "the integrator found no further step".to_owned(),
+            FallCause::NotFinite => "the motion is no number".to_owned(),
+        })
     }
 
     fn measure(&mut self, state: &mut PlantState) {
@@ -139,12 +145,11 @@ impl SimulatedRobot {
 /// What it takes to hold the posture, per joint of the floating robot: for a robot that stands still on its stance sole.
 struct Holding {
     torque: Vec<f64>,
-    stiffness: Vec<f64>,
-    damping: Vec<f64>,
+    gains: HoldingGains,
 }
 
 impl Holding {
-    fn new(setup: &Setup) -> Result<Self, String> {
+    fn new(setup: &Setup, state: &State) -> Result<Self, String> {
         let robot = &setup.robot;
         let rooted = robot.rooted_at(setup.stance_frame()).map_err(|error| error.to_string())?;
         let tree = &rooted.model.tree;
@@ -170,12 +175,9 @@ impl Holding {
                 .map_err(|error| error.to_string())?;
             Ok::<_, String>(values)
         };
-        let (frequency, ratio) = (WATCHDOG_FREQUENCY, WATCHDOG_DAMPING_RATIO);
-        Ok(Self {
-            torque: floating(&gravity)?,
-            stiffness: floating(&inertia)?.iter().map(|inertia| inertia * frequency * frequency).collect(),
-            damping: floating(&inertia)?.iter().map(|inertia| 2.0 * ratio * inertia * frequency).collect(),
-        })
+        let period = setup.scenario.plant.step_s;
+        let gains = HoldingGains::new(&robot.tree, state, &floating(&inertia)?, period);
+        Ok(Self { torque: floating(&gravity)?, gains: gains.map_err(|error| error.to_string())? })
     }
 }
 
@@ -204,7 +206,7 @@ fn model(setup: &Setup) -> Result<PlantModel, Failure> {
     })
 }
 
-fn config(setup: &Setup, holding: &Holding, min_base_height: f64) -> Result<PlantConfig, Failure> {
+fn config(setup: &Setup, holding: &Holding, start: &Start) -> Result<PlantConfig, Failure> {
     let Setup { robot, scenario, .. } = setup;
     let plant = &scenario.plant;
     let limits = robot.limits.iter().map(|limit| match plant.torque_limits {
@@ -226,52 +228,104 @@ fn config(setup: &Setup, holding: &Holding, min_base_height: f64) -> Result<Plan
             delay: plant.actuator_delay_s,
             ..ActuatorConfig::default()
         },
-        sensors: sensors(&scenario.sensors),
-        pushes: pushes.map(|push| made_push(robot, push)).collect::<Result<_, _>>()?,
+        terrain: terrain(scenario),
+        contact: ContactOptions { ground: ground(setup), ..ContactOptions::default() },
+        sensors: sensors(setup)?,
+        pushes: pushes.map(|push| made_push(robot, push, start)).collect::<Result<_, _>>()?,
         watchdog: WatchdogConfig {
-            stiffness: holding.stiffness.clone(),
-            damping: holding.damping.clone(),
+            // Holds the start until there is a command; afterwards a plan that ran out is nearer to the robot than its start.
+            law: Some(AffineLaw::joint_stiffness(
+                &holding.torque,
+                &start.q,
+                &holding.gains.stiffness,
+                &holding.gains.damping,
+            )),
+            static_law: 0.0,
+            stiffness: holding.gains.stiffness.clone(),
+            damping: holding.gains.damping.clone(),
             ..WatchdogConfig::default()
         },
-        monitor: MonitorConfig {
-            stance_foot: stance.unwrap_or(0),
-            min_base_height,
-            ..MonitorConfig::default()
-        },
+        monitor: MonitorConfig { stance_foot: stance.unwrap_or(0), ..MonitorConfig::default() },
         seed: scenario.seed,
         ..PlantConfig::default()
     })
 }
 
-fn sensors(settings: &SensorSettings) -> SensorConfig {
-    let delay = settings.delay_s;
-    if settings.noise_scale == 0.0 {
-        return SensorConfig { delay, ..SensorConfig::PERFECT };
+fn terrain(scenario: &Scenario) -> Terrain {
+    let boxes = scenario.terrain.boxes.iter().map(|block| TerrainBox {
+        center: block.center_m.into(),
+        half_size: block.half_size_m.into(),
+        yaw: block.yaw_rad,
+    });
+    let gaps = scenario.terrain.gaps.iter().map(|gap| TerrainGap { min: gap.min_m, max: gap.max_m });
+    Terrain { plane_height: Some(0.0), boxes: boxes.collect(), gaps: gaps.collect(), slope: slope(scenario) }
+}
+
+/// Spring and damper under every contact such that the robot's weight on its stance sole sinks as far as the scenario says.
+fn ground(setup: &Setup) -> GroundGive {
+    let Setup { robot, scenario, .. } = setup;
+    let sink = scenario.plant.ground_sink_m;
+    if sink == 0.0 {
+        return GroundGive::RIGID;
     }
-    SensorConfig {
+    let mass = robot.tree.total_mass() * scenario.plant.mass_scale;
+    let points = robot.sole(&scenario.robot.stance).map_or(1, |sole| sole.contacts.len().max(1)) as f64;
+    let stiffness = mass * robot.tree.gravity_w().norm() / (sink * points);
+    let critical = 2.0 * (stiffness * mass / points).sqrt();
+    GroundGive { stiffness, damping: scenario.plant.ground_damping_ratio * critical }
+}
+
+fn sensors(setup: &Setup) -> Result<SensorConfig, Failure> {
+    let settings = &setup.scenario.sensors;
+    let (body, believed) = setup.inertial_unit().map_err(Failure::Input)?;
+    let misalignment = RigidTransform::from_xyz_rpy(Vector3::zeros(), settings.imu_misalignment_rad.into());
+    let mounting = believed * misalignment;
+    let there = SensorConfig {
+        delay: settings.delay_s,
+        has_inertial_unit: settings.inertial_unit,
+        inertial_unit: InertialUnitConfig { body, mounting, ..InertialUnitConfig::PERFECT },
+        has_foot_wrench: settings.foot_wrench,
+        has_motion_capture: settings.motion_capture,
+        ..SensorConfig::PERFECT
+    };
+    if settings.noise_scale == 0.0 {
+        return Ok(there);
+    }
+    Ok(SensorConfig {
         position_noise: settings.position_noise_rad,
         position_bias: settings.position_bias_rad,
         position_resolution: settings.position_resolution_rad,
         velocity_noise: settings.velocity_noise_rad_s,
         velocity_resolution: settings.velocity_resolution_rad_s,
+        inertial_unit: InertialUnitConfig {
+            body,
+            mounting,
+            gyro_noise: settings.gyro_noise_rad_s,
+            gyro_bias: settings.gyro_bias_rad_s,
+            gyro_bias_walk: settings.gyro_bias_walk_rad_s,
+            gyro_resolution: settings.gyro_resolution_rad_s,
+            accelerometer_noise: settings.accelerometer_noise_m_s2,
+            accelerometer_bias: settings.accelerometer_bias_m_s2,
+            accelerometer_bias_walk: settings.accelerometer_bias_walk_m_s2,
+            accelerometer_resolution: settings.accelerometer_resolution_m_s2,
+        },
         base_position_noise: settings.base_position_noise_m,
         base_orientation_noise: settings.base_orientation_noise_rad,
-        base_angular_velocity_noise: settings.gyro_noise_rad_s,
-        base_angular_velocity_bias: settings.gyro_bias_rad_s,
+        base_angular_velocity_noise: settings.base_angular_velocity_noise_rad_s,
         base_linear_velocity_noise: settings.base_velocity_noise_m_s,
         force_noise: settings.foot_force_noise_n,
         torque_noise: settings.foot_torque_noise_nm,
         noise_scale: settings.noise_scale,
-        delay,
-    }
+        ..there
+    })
 }
 
-fn made_push(robot: &RobotModel, push: &PushSettings) -> Result<simulation::Push, Failure> {
+fn made_push(robot: &RobotModel, push: &PushSettings, start: &Start) -> Result<simulation::Push, Failure> {
     let body = robot.link(&push.link).and_then(|link| link.body).ok_or_else(|| on_no_body(&push.link))?;
     Ok(simulation::Push {
         body,
         point: robot.tree.bodies()[body].inertia.com,
-        direction_w: push.direction.into(),
+        direction_w: start.stance_frame_w.rotation * Vector3::from(push.direction),
         impulse: push.impulse_ns,
         start: push.start_s,
         duration: push.duration_s,

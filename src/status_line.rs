@@ -23,6 +23,7 @@ pub struct StatusLine {
     command: Option<Box<Command>>,
     colour: Colour,
     next_ns: u64,
+    stance_foot: usize,
 }
 
 #[derive(Debug)]
@@ -44,6 +45,7 @@ impl StatusLine {
         Self {
             links: connect(),
             polygon: polygon.unwrap_or_default(),
+            stance_foot: setup.stance_foot(),
             duration_s: setup.scenario.duration_s,
             period_s: 1.0 / setup.scenario.controller.mpc_rate_hz,
             state: None,
@@ -70,7 +72,8 @@ impl StatusLine {
         let (Some(state), Some(command)) = (&self.state, &self.command) else {
             return Some("starting".to_owned());
         };
-        let margin = pressure_point(&state.stance_torque_b, &state.stance_force_b)
+        let margin = (state.feet().get(self.stance_foot))
+            .and_then(|reading| pressure_point(&reading.torque_s, &reading.force_s))
             .map(|point| cop_margin_m(&self.polygon, &point))
             .map_or("in the air".to_owned(), |margin| format!("{:+5.1} mm", 1e3 * margin));
         // The level is said when there is something to say.

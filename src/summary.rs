@@ -124,7 +124,7 @@ impl Summary {
 }
 
 /// The keys that others read: none of them may ever be missing.
-pub const KEYS: [&str; 46] = [
+pub const KEYS: [&str; 49] = [
     "scenario",
     "seed",
     "success",
@@ -134,6 +134,7 @@ pub const KEYS: [&str; 46] = [
     "steps",
     "fell",
     "fall_time_s",
+    "fall_cause",
     "min_com_height_m",
     "max_stance_slip_m",
     "max_stance_tilt_rad",
@@ -167,6 +168,8 @@ pub const KEYS: [&str; 46] = [
     "plant_step_p50_s",
     "plant_real_time_factor",
     "energy_balance_error",
+    "estimator_tilt_rms_rad",
+    "estimator_velocity_rms_m_s",
     "plant_pauses",
     "log_records_dropped",
     "commands_refused",
@@ -177,7 +180,8 @@ pub const KEYS: [&str; 46] = [
 fn missed_criterion(scenario: &Scenario, plant: &PlantPart) -> Option<String> {
     let (limit, robot) = (&scenario.success, &plant.robot);
     if limit.no_fall && robot.fell {
-        return Some(format!("the robot fell at {:.3} s", robot.fall_time_s.unwrap_or_default()));
+        let cause = robot.fall_cause.as_ref().map_or(String::new(), |cause| format!(": {cause}"));
+        return Some(format!("the robot fell at {:.3} s{cause}", robot.fall_time_s.unwrap_or_default()));
     }
     if limit.no_touch_down && robot.other_foot_touched {
         return Some("a foot that was in the air touched the ground".to_owned());

@@ -27,6 +27,10 @@ pub struct Truth {
     pub base_position_w: [f64; 3],
     /// Orientation of the base link frame: unit quaternion x, y, z, w.
     pub base_orientation_w: [f64; 4],
+    /// Angular velocity of the base link in its own axes (rad/s).
+    pub base_angular_velocity_b: [f64; 3],
+    /// Velocity of the origin of the base link frame, in its axes (m/s).
+    pub base_linear_velocity_b: [f64; 3],
     /// Mass centre (m).
     pub com_w: [f64; 3],
     /// Its velocity (m/s).
@@ -35,7 +39,7 @@ pub struct Truth {
     pub sole_position_w: [f64; 3],
     /// Path of the sole's contact patch along the ground since it touched down (m).
     pub stance_slip_m: f64,
-    /// Angle between the sole's normal and the vertical (rad).
+    /// Angle between the sole's normal and the ground's (rad).
     pub sole_tilt_rad: f64,
     /// Torque of the ground on the stance foot about the sole's origin, in its axes (N m).
     pub stance_torque_b: [f64; 3],

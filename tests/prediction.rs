@@ -157,7 +157,7 @@ fn the_summary_is_what_the_log_says() {
     assert!(matches!(output.status.code(), Some(0 | 1)), "{}", String::from_utf8_lossy(&output.stderr));
 
     let setup = Setup::read(&folder.join("scenario.toml"), &[]).unwrap();
-    let mut metrics = Metrics::new(&setup.scenario);
+    let mut metrics = Metrics::new(&setup.scenario).in_stance_frame(&setup.start().unwrap().stance_frame_w);
     let (mut steps, mut commands) = (0, 0_u64);
     let log = std::fs::read(folder.join("log.mcap")).unwrap();
     for message in mcap::MessageStream::new(&log).unwrap() {
@@ -166,6 +166,7 @@ fn the_summary_is_what_the_log_says() {
             metrics.observe(&read_record::<Truth>(&message.data).unwrap());
             steps += 1;
         } else if message.channel.topic == delmpc::log::COMMAND {
+            metrics.observe_estimate(&read_record::<Command>(&message.data).unwrap());
             commands += 1;
         }
     }

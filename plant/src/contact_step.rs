@@ -16,6 +16,15 @@
 //! 6 stop if |W (λ_new - λ)| <= 1e-7 (|W λ_new| + g Δt);  λ := λ_new;  go to 4 (at most 8 rounds)
 //! ```
 //!
+//! Ground that gives, with spring `k` and damper `d` under a contact, pushes with `f = -k φ_end - d v`, `f >= 0`. With the gap at the end
+//! taken as `φ̂ + Δt v` that is the same law with another target and a compliance on the normal's diagonal of `W`:
+//!
+//! ```text
+//! v* = -k φ̂ / (k Δt + d)        W_nn += 1 / (Δt (k Δt + d))        λ_n = f Δt
+//! ```
+//!
+//! Implicit in spring and damper, hence stable at any stiffness, and for `k -> ∞` the rigid law. (Half of `k Δt` acts as a damper.)
+//!
 //! The state `p` is the physical momentum at every boundary, rest is exact inside the step, and no contact mode is named beforehand.
 //! Gains above `1/Δt` on `φ̂` would flip the sign of the gap in every step; above `v_rec` the correction throws the body off the ground.
 //!
@@ -44,7 +53,7 @@ use crate::terrain::Terrain;
 
 mod report;
 
-pub use report::{ContactOptions, ContactPoint, ContactReport, ContactResult};
+pub use report::{ContactOptions, ContactPoint, ContactReport, ContactResult, GroundGive};
 
 /// Reach of the candidate test, m.
 const CANDIDATE_MARGIN: f64 = 1e-4;
@@ -86,6 +95,8 @@ pub struct ContactStep {
     forces: Vec<PointForce>,
     response_w: Vec<f64>,
     response_c: Vec<f64>,
+    /// `W` with the compliance of the ground.
+    response_with_ground: Vec<f64>,
     free_velocity: Vec<f64>,
     end_velocity: Vec<f64>,
     friction: Vec<f64>,
@@ -142,6 +153,7 @@ impl ContactStep {
             forces: Vec::with_capacity(capacity + options.max_pushes),
             response_w: vec![0.0; n * n],
             response_c: vec![0.0; n * n],
+            response_with_ground: vec![0.0; n * n],
             free_velocity: vec![0.0; n],
             end_velocity: vec![0.0; n],
             friction: vec![0.0; capacity],
@@ -260,6 +272,11 @@ impl ContactStep {
         &self.terrain
     }
 
+    /// Whether the ground does not give.
+    pub fn ground_is_rigid(&self) -> bool {
+        self.options.ground.is_rigid()
+    }
+
     /// What happened at every contact in the last step.
     pub fn results(&self) -> &[ContactResult] {
         &self.results
@@ -331,7 +348,10 @@ impl ContactStep {
             }
             if reach < CANDIDATE_MARGIN {
                 let left = surface.gap + 0.5 * dt * velocity.z;
-                let target = if left >= 0.0 {
+                let target = if !self.options.ground.is_rigid() {
+                    let GroundGive { stiffness, damping } = self.options.ground;
+                    -stiffness * left / (stiffness * dt + damping)
+                } else if left >= 0.0 {
                     -left / dt
                 } else {
                     (-self.options.correction * left / dt).min(recovery)
@@ -475,6 +495,17 @@ impl ContactStep {
         for (i, candidate) in self.candidates.iter().enumerate() {
             self.free_velocity[3 * i + 2] -= candidate.target;
         }
+        let GroundGive { stiffness, damping } = self.options.ground;
+        let response = if self.options.ground.is_rigid() {
+            response
+        } else {
+            let with_ground = &mut self.response_with_ground[..n * n];
+            with_ground.copy_from_slice(response);
+            for k in (2..n).step_by(3) {
+                with_ground[k * n + k] += 1.0 / (self.time_step * (stiffness * self.time_step + damping));
+            }
+            with_ground
+        };
         let problem = ContactProblem {
             response,
             free_velocity: &self.free_velocity[..n],
@@ -568,6 +599,14 @@ fn check(
     require(share(strength), "regularisation", strength, "in [0, 1]")?;
     require(share(forgetting), "forgetting", forgetting, "in [0, 1]")?;
     require(options.tolerance > 0.0 && options.tolerance < 1.0, "tolerance", options.tolerance, "in (0, 1)")?;
+    let GroundGive { stiffness, damping } = options.ground;
+    require(stiffness > 0.0, "stiffness of the ground", stiffness, "positive (infinite for rigid)")?;
+    require(
+        damping.is_finite() && damping >= 0.0,
+        "damping of the ground",
+        damping,
+        "finite and not negative",
+    )?;
     require(options.max_rounds > 0, "rounds", options.max_rounds as f64, "at least 1")?;
     require(options.max_candidates <= 64, "candidates", options.max_candidates as f64, "at most 64")
 }

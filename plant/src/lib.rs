@@ -9,7 +9,7 @@
 //! ```
 //!
 //! Reading order: [`plant`], [`contact_step`], [`contact_law`], [`friction_cone`], [`cone_program`], [`terrain`], [`monitor`],
-//! [`servo`], [`actuators`], [`sensors`], [`disturbances`].
+//! [`servo`], [`watchdog_gains`], [`actuators`], [`sensors`], [`inertial_unit`], [`disturbances`].
 //!
 //! Allocation: none in a warm [`plant::Plant::step`], except what Clarabel takes when a cone program is solved (measured in
 //! `tests/allocation.rs`); at rest none is.
@@ -43,6 +43,7 @@ pub(crate) mod dense;
 pub mod disturbances;
 pub mod error;
 pub mod friction_cone;
+pub mod inertial_unit;
 pub mod monitor;
 pub mod plant;
 pub mod random;
@@ -50,17 +51,22 @@ pub mod sensors;
 pub mod servo;
 pub(crate) mod step_newton;
 pub mod terrain;
+pub mod watchdog_gains;
 
 /// What most users need.
 pub mod prelude {
     pub use crate::actuators::{ActuatorConfig, ActuatorLimits};
     pub use crate::contact_law::Regularisation;
-    pub use crate::contact_step::{ContactOptions, ContactPoint, ContactReport, ContactResult, ContactStep};
+    pub use crate::contact_step::{
+        ContactOptions, ContactPoint, ContactReport, ContactResult, ContactStep, GroundGive,
+    };
     pub use crate::disturbances::{ModelErrors, Push};
     pub use crate::error::PlantError;
+    pub use crate::inertial_unit::{InertialReading, InertialUnitConfig};
     pub use crate::monitor::{FallCause, Foot, FootReport, Monitor, MonitorConfig, Totals};
     pub use crate::plant::{Plant, PlantConfig, PlantModel, PlantStep};
     pub use crate::sensors::{Readings, SensorConfig};
     pub use crate::servo::{AffineLaw, CommandRefused, WatchdogConfig};
     pub use crate::terrain::{Terrain, TerrainBox, TerrainGap};
+    pub use crate::watchdog_gains::{HoldingGains, joint_inverse_inertia, spectral_radius};
 }

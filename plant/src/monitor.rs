@@ -16,6 +16,7 @@ use nalgebra::Vector3;
 
 use crate::contact_step::{ContactPoint, ContactResult, ContactStep};
 use crate::error::{PlantError, require};
+use crate::terrain::Terrain;
 
 /// Slip below this speed is round-off and creep, m/s.
 const SLIP_SPEED: f64 = 1e-6;
@@ -56,7 +57,7 @@ pub struct FootReport {
     pub slip_speed: f64,
     /// Path of slip since the last touch-down, m.
     pub slip: f64,
-    /// Angle between sole and ground, rad.
+    /// Angle between sole and ground, rad; of ground that gives, between the sole and where the ground has given way to.
     pub tilt: f64,
     /// When it touched down last, s; `None` while in the air.
     pub touch_down: Option<f64>,
@@ -85,12 +86,17 @@ impl Default for FootReport {
 /// Why the robot counts as fallen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FallCause {
-    /// The base came too close to the ground.
-    BaseHeight,
-    /// The base leans too far.
+    /// The mass centre came too far down.
+    MassCentreHeight,
+    /// The base leans too far from how it leaned at the start.
     BaseTilt,
-    /// Something that is no foot touched the ground.
-    BodyContact,
+    /// This body, which is no foot, touched the ground.
+    BodyContact {
+        /// The body.
+        body: usize,
+    },
+    /// The integrator found no step from here on.
+    NoStep,
     /// A state that is no number.
     NotFinite,
 }
@@ -100,9 +106,9 @@ pub enum FallCause {
 pub struct MonitorConfig {
     /// The foot on which the robot stands.
     pub stance_foot: usize,
-    /// Least height of the base's mass centre above the ground below it, m.
-    pub min_base_height: f64,
-    /// Largest angle between the base's own vertical and the world's, rad.
+    /// Least height of the mass centre above the stance foot, as a part of that at the start.
+    pub min_com_height_share: f64,
+    /// Largest angle between the vertical and where in the base it was at the start, rad.
     pub max_base_tilt: f64,
     /// Whether load on a contact that belongs to no foot is a fall.
     pub body_contact_is_fall: bool,
@@ -110,7 +116,7 @@ pub struct MonitorConfig {
 
 impl Default for MonitorConfig {
     fn default() -> Self {
-        Self { stance_foot: 0, min_base_height: 0.4, max_base_tilt: 1.0, body_contact_is_fall: true }
+        Self { stance_foot: 0, min_com_height_share: 0.5, max_base_tilt: 1.0, body_contact_is_fall: true }
     }
 }
 
@@ -183,6 +189,9 @@ pub struct Monitor {
     /// Whether a contact belongs to a foot.
     on_foot: Vec<bool>,
     weight: f64,
+    /// Height of the mass centre above the ground's plane at the start, and the vertical in the base's axes.
+    start_height: f64,
+    start_up_b: Vector3<f64>,
     totals: Totals,
 }
 
@@ -220,6 +229,8 @@ impl Monitor {
             reports: vec![FootReport::default(); feet.len()],
             on_foot,
             weight: tree.total_mass() * tree.gravity_w().norm(),
+            start_height: 0.0,
+            start_up_b: Vector3::z(),
             totals: Totals {
                 fall: None,
                 min_com_height: f64::INFINITY,
@@ -272,9 +283,27 @@ impl Monitor {
         self.totals.start_energy = energy;
     }
 
+    /// From which posture a fall is judged.
+    pub(crate) fn set_start(&mut self, tree: &KinematicTree, motion: &BoundaryMotion) {
+        self.start_height = self.height(tree, motion);
+        self.start_up_b = motion.kinematics().mass_centre_pose_w(0).rotation.row(2).transpose();
+    }
+
+    /// Height of the mass centre above the lowest contact point of a foot, m.
+    fn height(&self, tree: &KinematicTree, motion: &BoundaryMotion) -> f64 {
+        let kinematics = motion.kinematics();
+        let feet = self.feet.iter().map(|foot| {
+            let pose = kinematics.link_poses_w()[foot.body] * foot.sole;
+            pose.translation.z
+        });
+        let lowest = feet.fold(f64::INFINITY, f64::min);
+        let com = kinematics.mass_centre_of_tree_w(tree).z;
+        if lowest.is_finite() { com - lowest } else { com }
+    }
+
     pub(crate) fn count_failure(&mut self, time: f64) {
         self.totals.unconverged_steps += 1;
-        self.totals.fall.get_or_insert((time, FallCause::NotFinite));
+        self.totals.fall.get_or_insert((time, FallCause::NoStep));
     }
 
     /// Takes in one step that ended at `time`.
@@ -315,6 +344,7 @@ impl Monitor {
         time: f64,
         converged: bool,
     ) {
+        let height = self.height(tree, motion);
         let totals = &mut self.totals;
         totals.unconverged_steps += u64::from(!converged);
         let com = motion.kinematics().mass_centre_of_tree_w(tree);
@@ -326,18 +356,17 @@ impl Monitor {
             return;
         }
         let base = motion.kinematics().mass_centre_pose_w(0);
-        let ground = step.terrain().height_at(base.translation.x, base.translation.y);
-        let height = ground.map_or(f64::INFINITY, |ground| base.translation.z - ground);
-        let body_contact =
-            step.results().iter().zip(&self.on_foot).any(|(result, on_foot)| result.touching && !on_foot);
+        let tilt = base.rotation.row(2).transpose().dot(&self.start_up_b);
+        let body_contact = step.results().iter().zip(&self.on_foot).zip(step.contacts());
+        let mut body_contact = body_contact.filter(|((result, on_foot), _)| result.touching && !**on_foot);
         let cause = if !com.iter().all(|x| x.is_finite()) {
             Some(FallCause::NotFinite)
-        } else if height < self.config.min_base_height {
-            Some(FallCause::BaseHeight)
-        } else if base.rotation[(2, 2)] < self.config.max_base_tilt.cos() {
+        } else if height < self.config.min_com_height_share * self.start_height {
+            Some(FallCause::MassCentreHeight)
+        } else if tilt < self.config.max_base_tilt.cos() {
             Some(FallCause::BaseTilt)
-        } else if body_contact && self.config.body_contact_is_fall {
-            Some(FallCause::BodyContact)
+        } else if self.config.body_contact_is_fall {
+            body_contact.next().map(|(_, contact)| FallCause::BodyContact { body: contact.body })
         } else {
             None
         };
@@ -371,9 +400,12 @@ fn update_foot(
     let results = || foot.contacts.iter().map(|&i| &step.results()[i]);
     let was_touching = report.touching;
     report.touching = results().any(|result| result.touching);
-    let normal = ground_normal(results());
+    let normal = ground_normal(results(), step.terrain());
     let up: Vector3<f64> = pose.rotation.column(2).into();
-    report.tilt = up.cross(&normal).norm().atan2(up.dot(&normal));
+    report.tilt = match step.ground_is_rigid() {
+        true => up.cross(&normal).norm().atan2(up.dot(&normal)),
+        false => lift_angle(results()),
+    };
     report.slip_speed = patch_speed(results());
     if report.touching {
         if !was_touching {
@@ -412,12 +444,23 @@ fn update_foot(
         if limit > 0.0 { (pose.rotation * about_point).dot(&normal).abs() / limit } else { 0.0 };
 }
 
-fn ground_normal<'a>(results: impl Iterator<Item = &'a ContactResult>) -> Vector3<f64> {
+fn ground_normal<'a>(results: impl Iterator<Item = &'a ContactResult>, terrain: &Terrain) -> Vector3<f64> {
     let sum: Vector3<f64> = results
         .filter(|result| result.touching)
         .map(|result| result.frame.row(2).transpose() * result.normal_impulse)
         .sum();
-    sum.try_normalize(0.0).unwrap_or_else(Vector3::z)
+    sum.try_normalize(0.0).unwrap_or_else(|| terrain.normal_w())
+}
+
+/// Tilt of a sole against ground that gives: what sinks with its load is the ground's, so it is the angle under which the highest
+/// contact has come off, seen from the lowest one.
+fn lift_angle<'a>(results: impl Iterator<Item = &'a ContactResult> + Clone) -> f64 {
+    let by_gap = |a: &&ContactResult, b: &&ContactResult| a.gap.total_cmp(&b.gap);
+    let Some((highest, lowest)) = results.clone().max_by(by_gap).zip(results.min_by(by_gap)) else {
+        return 0.0;
+    };
+    let distance = (highest.start_w - lowest.start_w).norm();
+    if highest.gap <= 0.0 || distance == 0.0 { 0.0 } else { (highest.gap / distance).min(1.0).asin() }
 }
 
 fn patch_speed<'a>(results: impl Iterator<Item = &'a ContactResult> + Clone) -> f64 {

@@ -3,20 +3,26 @@
 use delmpc_mechanics::energy::{gravity_energy, spring_energy};
 use delmpc_mechanics::forces::PointForce;
 use delmpc_mechanics::kinematics::base_link_pose;
+use delmpc_mechanics::load_response::BoundaryMotion;
 use delmpc_mechanics::spatial::Twist;
 use delmpc_mechanics::state::State;
 use delmpc_mechanics::tree::KinematicTree;
-use delmpc_messages::{Command, FallbackLevel, MAX_JOINTS, PlantState, status};
-use nalgebra::{Rotation3, UnitQuaternion, Vector3};
+use delmpc_messages::{
+    Command, FallbackLevel, FootReading, MAX_FEET, MAX_JOINTS, PlantState, ServoReadings, foot, sensor,
+    status,
+};
+use nalgebra::{DMatrix, Rotation3, UnitQuaternion, Vector3};
 
 use crate::actuators::{ActuatorConfig, Actuators};
 use crate::contact_step::{ContactOptions, ContactPoint, ContactReport, ContactStep};
 use crate::disturbances::{ModelErrors, Push};
 use crate::error::{PlantError, require, require_length};
+use crate::inertial_unit::InertialUnit;
 use crate::monitor::{Foot, Monitor, MonitorConfig, StepWork};
 use crate::sensors::{Readings, SensorConfig, Sensors};
 use crate::servo::{CommandRefused, Servo, WatchdogConfig};
 use crate::terrain::Terrain;
+use crate::watchdog_gains::{joint_inverse_inertia, spectral_radius};
 
 /// The robot as its builders describe it.
 #[derive(Clone, Debug)]
@@ -97,6 +103,8 @@ pub struct Plant {
     servo: Servo,
     actuators: Actuators,
     sensors: Sensors,
+    inertial_unit: InertialUnit,
+    foot_readings: [FootReading; MAX_FEET],
     monitor: Monitor,
     pushes: Vec<Push>,
     pull: Option<PointForce>,
@@ -120,6 +128,14 @@ impl Plant {
         if joints > MAX_JOINTS {
             return Err(PlantError::Shape { quantity: "joints", got: joints, expected: MAX_JOINTS });
         }
+        if model.feet.len() > MAX_FEET {
+            return Err(PlantError::Shape { quantity: "feet", got: model.feet.len(), expected: MAX_FEET });
+        }
+        let unit = &config.sensors.inertial_unit;
+        if unit.body >= tree.body_count() {
+            let (got, expected) = (unit.body, tree.body_count());
+            return Err(PlantError::Shape { quantity: "body of the inertial unit", got, expected });
+        }
         require_length("joint coordinates", state.q.len(), joints)?;
         require_length("momenta", state.p.len(), tree.dof())?;
         for push in &config.pushes {
@@ -141,14 +157,17 @@ impl Plant {
             contact,
             servo: Servo::new(joints, model.joint_set_hash, config.watchdog.clone())?,
             actuators: Actuators::new(joints, dt, &config.actuators)?,
-            sensors: Sensors::new(joints, dt, &config.sensors, config.seed)?,
+            sensors: Sensors::new(joints, model.feet.len(), dt, &config.sensors, config.seed)?,
+            inertial_unit: InertialUnit::new(unit, config.sensors.noise_scale, config.seed),
+            foot_readings: [FootReading { flags: 0, reserved: 0, torque_s: [0.0; 3], force_s: [0.0; 3] };
+                MAX_FEET],
             monitor: Monitor::new(&tree, &contacts, &model.feet, config.monitor)?,
             acting: Vec::with_capacity(config.pushes.len() + 1),
             pull: None,
             pushes: config.pushes.clone(),
             asked: vec![0.0; joints],
             velocity: vec![0.0; tree.dof()],
-            truth: Readings::zeros(joints),
+            truth: Readings::zeros(joints, model.feet.len()),
             last: PlantStep {
                 contact: ContactReport::default(),
                 level: FallbackLevel::ZeroTorque,
@@ -158,15 +177,43 @@ impl Plant {
             tree,
         };
         plant.start()?;
+        plant.check_watchdog(&config.watchdog)?;
         Ok(plant)
     }
 
+    /// Refuses a watchdog that would shake the robot: every rung's law, sampled at the plant's rate, on the robot with a free base.
+    fn check_watchdog(&self, config: &WatchdogConfig) -> Result<(), PlantError> {
+        let n = self.tree.joint_count();
+        let diagonal = |values: &[f64]| {
+            let value = |i: usize| values.get(i).copied().unwrap_or(0.0);
+            DMatrix::from_fn(n, n, |row, column| if row == column { value(row) } else { 0.0 })
+        };
+        let none = DMatrix::zeros(n, n);
+        let damping = diagonal(&config.damping);
+        let mut laws = vec![
+            ("spectral radius of the watchdog's gravity hold", diagonal(&config.stiffness), damping.clone()),
+            ("spectral radius of the watchdog's damping", none, damping),
+        ];
+        if let Some(law) = &config.law {
+            let part = |first: usize| DMatrix::from_fn(n, n, |row, j| -law.gain[row * 2 * n + first + j]);
+            laws.push(("spectral radius of the watchdog's static law", part(0), part(n)));
+        }
+        let inverse = joint_inverse_inertia(&self.tree, &self.state)?;
+        for (quantity, stiffness, damping) in laws {
+            let radius = spectral_radius(&inverse, &stiffness, &damping, self.contact.time_step());
+            // Without any gain every mode stays as it is.
+            require(radius <= 1.0 + 1e-9, quantity, radius, "at most 1: lower its stiffness and damping")?;
+        }
+        Ok(())
+    }
+
     fn start(&mut self) -> Result<(), PlantError> {
-        let mut motion = delmpc_mechanics::load_response::BoundaryMotion::new(&self.tree);
+        let mut motion = BoundaryMotion::new(&self.tree);
         motion.update(&self.tree, &self.state).map_err(|cause| PlantError::Step { time: 0.0, cause })?;
         self.velocity.copy_from_slice(motion.velocity());
         self.monitor.set_start_energy(energy(&self.tree, &self.state, &motion)?);
-        self.observe();
+        self.monitor.set_start(&self.tree, &motion);
+        self.observe(&motion);
         self.sensors.preset();
         Ok(())
     }
@@ -179,7 +226,15 @@ impl Plant {
         let (now_ns, dt) = (self.time_ns(), self.contact.time_step());
         let time = self.time();
         let fresh = self.sensors.fresh();
-        self.servo.torque_into(now_ns, &fresh.position, &fresh.velocity, &mut self.asked);
+        foot_readings(&self.sensors, fresh, &mut self.foot_readings);
+        let imu = self.sensors.config().has_inertial_unit;
+        let readings = ServoReadings {
+            position: &fresh.position,
+            velocity: &fresh.velocity,
+            imu: imu.then(|| (fresh.inertial.angle.into(), fresh.inertial.angular_velocity.into())),
+            feet: &self.foot_readings[..fresh.foot_wrench.len()],
+        };
+        self.servo.torque_into(now_ns, &readings, &mut self.asked);
         let base = self.tree.base_dof();
         self.actuators.apply(&self.asked, &self.velocity[base..]);
         self.acting.clear();
@@ -201,7 +256,8 @@ impl Plant {
         let energy = energy(&self.tree, &self.state, motion)?;
         let end = self.time();
         self.monitor.update(&self.tree, &self.contact, end, contact.converged, energy, &work);
-        self.observe();
+        Self::observe_motion(&self.tree, motion, &mut self.inertial_unit, dt, &mut self.truth);
+        self.observe_rest();
         self.last = PlantStep {
             contact,
             level: self.servo.level(),
@@ -255,8 +311,31 @@ impl Plant {
         work
     }
 
-    /// Truth and sensors at the present time.
-    fn observe(&mut self) {
+    /// Truth and sensors at the present time, from a motion that is not the contact step's own.
+    fn observe(&mut self, motion: &BoundaryMotion) {
+        let dt = self.contact.time_step();
+        Self::observe_motion(&self.tree, motion, &mut self.inertial_unit, dt, &mut self.truth);
+        self.observe_rest();
+    }
+
+    /// What the inertial unit feels.
+    fn observe_motion(
+        tree: &KinematicTree,
+        motion: &BoundaryMotion,
+        unit: &mut InertialUnit,
+        time_step: f64,
+        truth: &mut Readings,
+    ) {
+        let (body, mounting) = (unit.config().body, unit.config().mounting);
+        let kinematics = motion.kinematics();
+        let pose_w = kinematics.link_poses_w()[body] * mounting;
+        let velocity_w = motion.velocity_at_w(body, &pose_w.translation);
+        let angular_velocity_w = kinematics.velocities_w()[body].angular;
+        truth.inertial = unit.sample(&pose_w, &velocity_w, &angular_velocity_w, tree.gravity_w(), time_step);
+    }
+
+    /// Everything else, and the sensors.
+    fn observe_rest(&mut self) {
         let base = self.tree.base_dof();
         let truth = &mut self.truth;
         truth.time_ns = self.steps * self.step_ns;
@@ -271,8 +350,8 @@ impl Plant {
             truth.base_pose_w = base_link_pose(&self.tree, &self.state.base_pose);
             truth.base_twist_b = truth.base_pose_w.inverse_transform_twist(&twist_w);
         }
-        if let Some(report) = self.monitor.reports().get(self.monitor.stance_foot()) {
-            truth.stance_wrench = report.wrench;
+        for (wrench, report) in truth.foot_wrench.iter_mut().zip(self.monitor.reports()) {
+            *wrench = report.wrench;
         }
         truth.contact_flags = self.monitor.contact_flags();
         self.sensors.read(truth);
@@ -285,8 +364,15 @@ impl Plant {
         message.time_ns = told.time_ns;
         message.applied_command_sequence = self.servo.applied_sequence();
         message.n_joints = n as u32;
-        message.stance_foot = self.monitor.stance_foot() as u32;
-        message.contact_flags = told.contact_flags;
+        message.n_feet = told.foot_wrench.len() as u32;
+        let config = self.sensors.config();
+        message.sensors = 0;
+        for (bits, there) in [
+            (sensor::INERTIAL_UNIT | sensor::INERTIAL_SUMS, config.has_inertial_unit),
+            (sensor::MOTION_CAPTURE, config.has_motion_capture),
+        ] {
+            message.sensors |= if there { bits } else { 0 };
+        }
         message.watchdog_level = self.servo.level() as u32;
         let watchdog = self.servo.on_watchdog(self.time_ns());
         for (bit, set) in [
@@ -310,8 +396,11 @@ impl Plant {
         message.base_orientation_w = [q.i, q.j, q.k, q.w];
         message.base_angular_velocity_b = told.base_twist_b.angular.into();
         message.base_linear_velocity_b = told.base_twist_b.linear.into();
-        message.stance_torque_b = told.stance_wrench.torque.into();
-        message.stance_force_b = told.stance_wrench.force.into();
+        message.imu_angle = told.inertial.angle.into();
+        message.imu_velocity = told.inertial.velocity.into();
+        message.imu_angular_velocity = told.inertial.angular_velocity.into();
+        message.imu_specific_force = told.inertial.specific_force.into();
+        foot_readings(&self.sensors, told, &mut message.feet);
     }
 
     /// Changes the friction coefficient of a contact point.
@@ -394,12 +483,22 @@ impl Plant {
     }
 }
 
+/// What is told of the feet.
+fn foot_readings(sensors: &Sensors, told: &Readings, out: &mut [FootReading; MAX_FEET]) {
+    let measured = if sensors.config().has_foot_wrench { foot::WRENCH } else { 0 };
+    for (index, (reading, wrench)) in out.iter_mut().zip(&told.foot_wrench).enumerate() {
+        let touches = if told.contact_flags & (1 << index) != 0 { foot::TOUCHES } else { 0 };
+        *reading = FootReading {
+            flags: measured | touches,
+            reserved: 0,
+            torque_s: wrench.torque.into(),
+            force_s: wrench.force.into(),
+        };
+    }
+}
+
 /// Kinetic and potential energy, J.
-fn energy(
-    tree: &KinematicTree,
-    state: &State,
-    motion: &delmpc_mechanics::load_response::BoundaryMotion,
-) -> Result<f64, PlantError> {
+fn energy(tree: &KinematicTree, state: &State, motion: &BoundaryMotion) -> Result<f64, PlantError> {
     let kinetic = 0.5 * state.p.iter().zip(motion.velocity()).map(|(p, v)| p * v).sum::<f64>();
     Ok(kinetic + gravity_energy(tree, motion.kinematics()) + spring_energy(tree, &state.q)?)
 }

@@ -4,14 +4,16 @@
 //! measured = quantise( true + bias + σ n )     n normal, new in every step; bias normal, drawn once
 //! ```
 //!
-//! Joint velocities come from `M⁻¹ p`, not from the integrator's interpolation (which has a lower order). The base pose is what a
-//! state estimator would give: pose of the base link frame, and its twist in its own axes.
+//! Joint velocities come from `M⁻¹ p`, not from the integrator's interpolation (which has a lower order). What a robot feels of its base
+//! is its inertial unit ([`crate::inertial_unit`]). The base pose, of the base link frame, and its twist in its own axes are those of
+//! motion capture, where there is one; else they are for the log only.
 
 use delmpc_mechanics::spatial::{RigidTransform, Twist, Wrench, exp_rotation};
 use nalgebra::Vector3;
 
 use crate::delay::{DelayLine, delay_steps};
 use crate::error::{PlantError, require};
+use crate::inertial_unit::{InertialReading, InertialUnitConfig};
 use crate::random::Random;
 
 /// Standard deviations, resolutions and delay; all 0 for perfect sensors.
@@ -27,14 +29,20 @@ pub struct SensorConfig {
     pub velocity_noise: f64,
     /// Smallest step of the joint velocities, rad/s or m/s; 0 for none.
     pub velocity_resolution: f64,
+    /// Whether there is an inertial unit.
+    pub has_inertial_unit: bool,
+    /// The inertial unit.
+    pub inertial_unit: InertialUnitConfig,
+    /// Whether every foot has a force and torque sensor.
+    pub has_foot_wrench: bool,
+    /// Whether the base is seen by motion capture.
+    pub has_motion_capture: bool,
     /// Noise of the base position, m.
     pub base_position_noise: f64,
     /// Noise of the base orientation, rad about each axis.
     pub base_orientation_noise: f64,
-    /// Noise of the gyroscope, rad/s.
+    /// Noise of the base's angular velocity, rad/s.
     pub base_angular_velocity_noise: f64,
-    /// Standard deviation of the constant bias of the gyroscope, rad/s.
-    pub base_angular_velocity_bias: f64,
     /// Noise of the base's linear velocity, m/s.
     pub base_linear_velocity_noise: f64,
     /// Noise of the foot force, N.
@@ -55,10 +63,13 @@ impl SensorConfig {
         position_resolution: 0.0,
         velocity_noise: 0.0,
         velocity_resolution: 0.0,
+        has_inertial_unit: true,
+        inertial_unit: InertialUnitConfig::PERFECT,
+        has_foot_wrench: true,
+        has_motion_capture: false,
         base_position_noise: 0.0,
         base_orientation_noise: 0.0,
         base_angular_velocity_noise: 0.0,
-        base_angular_velocity_bias: 0.0,
         base_linear_velocity_noise: 0.0,
         force_noise: 0.0,
         torque_noise: 0.0,
@@ -68,7 +79,7 @@ impl SensorConfig {
 }
 
 impl Default for SensorConfig {
-    /// Good encoders, a tactical IMU with a leg-odometry estimator, a strain-gauge foot sensor.
+    /// Good encoders, a tactical inertial unit, strain gauges under the feet.
     fn default() -> Self {
         Self {
             position_noise: 2e-5,
@@ -76,10 +87,17 @@ impl Default for SensorConfig {
             position_resolution: 1e-5,
             velocity_noise: 2e-3,
             velocity_resolution: 0.0,
+            has_inertial_unit: true,
+            inertial_unit: InertialUnitConfig {
+                gyro_noise: 2e-3,
+                accelerometer_noise: 0.02,
+                ..InertialUnitConfig::PERFECT
+            },
+            has_foot_wrench: true,
+            has_motion_capture: false,
             base_position_noise: 1e-4,
             base_orientation_noise: 1e-4,
             base_angular_velocity_noise: 2e-3,
-            base_angular_velocity_bias: 0.0,
             base_linear_velocity_noise: 2e-3,
             force_noise: 2.0,
             torque_noise: 0.2,
@@ -102,8 +120,10 @@ pub struct Readings {
     pub base_pose_w: RigidTransform,
     /// Twist of the base link frame in its own axes, at its origin.
     pub base_twist_b: Twist,
-    /// Wrench of the ground on the stance foot, sole frame, about its origin.
-    pub stance_wrench: Wrench,
+    /// The inertial unit.
+    pub inertial: InertialReading,
+    /// Wrench of the ground on every foot, sole frame, about its origin.
+    pub foot_wrench: Vec<Wrench>,
     /// Torque the actuators gave during the step that ended at this time.
     pub applied_torque: Vec<f64>,
     /// Bit i: foot i touches.
@@ -112,14 +132,15 @@ pub struct Readings {
 
 impl Readings {
     /// At rest at the origin.
-    pub fn zeros(joints: usize) -> Self {
+    pub fn zeros(joints: usize, feet: usize) -> Self {
         Self {
             time_ns: 0,
             position: vec![0.0; joints],
             velocity: vec![0.0; joints],
             base_pose_w: RigidTransform::identity(),
             base_twist_b: Twist::default(),
-            stance_wrench: Wrench::default(),
+            inertial: InertialReading::default(),
+            foot_wrench: vec![Wrench::default(); feet],
             applied_torque: vec![0.0; joints],
             contact_flags: 0,
         }
@@ -132,7 +153,8 @@ impl Readings {
         self.time_ns = other.time_ns;
         self.base_pose_w = other.base_pose_w;
         self.base_twist_b = other.base_twist_b;
-        self.stance_wrench = other.stance_wrench;
+        self.inertial = other.inertial;
+        self.foot_wrench.copy_from_slice(&other.foot_wrench);
         self.contact_flags = other.contact_flags;
     }
 }
@@ -143,17 +165,22 @@ pub struct Sensors {
     config: SensorConfig,
     random: Random,
     position_bias: Vec<f64>,
-    gyro_bias: Vector3<f64>,
     line: DelayLine<Readings>,
     fresh: Readings,
 }
 
 impl Sensors {
-    /// For `joints` joints read every `time_step` (s).
+    /// For `joints` joints and `feet` feet read every `time_step` (s).
     ///
     /// # Errors
     /// [`PlantError::Configuration`] for a negative or infinite number.
-    pub fn new(joints: usize, time_step: f64, config: &SensorConfig, seed: u64) -> Result<Self, PlantError> {
+    pub fn new(
+        joints: usize,
+        feet: usize,
+        time_step: f64,
+        config: &SensorConfig,
+        seed: u64,
+    ) -> Result<Self, PlantError> {
         let c = config;
         for value in [
             c.position_noise,
@@ -164,7 +191,6 @@ impl Sensors {
             c.base_position_noise,
             c.base_orientation_noise,
             c.base_angular_velocity_noise,
-            c.base_angular_velocity_bias,
             c.base_linear_velocity_noise,
             c.force_noise,
             c.torque_noise,
@@ -172,17 +198,16 @@ impl Sensors {
         ] {
             require(value.is_finite() && value >= 0.0, "sensor noise", value, "finite and not negative")?;
         }
+        c.inertial_unit.check()?;
         require((0.0..=1.0).contains(&c.delay), "sensor delay", c.delay, "in [0, 1] s")?;
         let mut random = Random::new(seed, 1);
         let position_bias = (0..joints).map(|_| c.noise_scale * c.position_bias * random.normal()).collect();
-        let gyro_bias = vector(&mut random, c.noise_scale * c.base_angular_velocity_bias);
         Ok(Self {
             config: *config,
             random,
             position_bias,
-            gyro_bias,
-            line: DelayLine::new(delay_steps(c.delay, time_step), Readings::zeros(joints)),
-            fresh: Readings::zeros(joints),
+            line: DelayLine::new(delay_steps(c.delay, time_step), Readings::zeros(joints, feet)),
+            fresh: Readings::zeros(joints, feet),
         })
     }
 
@@ -204,10 +229,12 @@ impl Sensors {
         pose.translation += vector(random, scale * c.base_position_noise);
         pose.rotation *= exp_rotation(&vector(random, scale * c.base_orientation_noise));
         let twist = &mut self.fresh.base_twist_b;
-        twist.angular += self.gyro_bias + vector(random, scale * c.base_angular_velocity_noise);
+        twist.angular += vector(random, scale * c.base_angular_velocity_noise);
         twist.linear += vector(random, scale * c.base_linear_velocity_noise);
-        self.fresh.stance_wrench.force += vector(random, scale * c.force_noise);
-        self.fresh.stance_wrench.torque += vector(random, scale * c.torque_noise);
+        for wrench in &mut self.fresh.foot_wrench {
+            wrench.force += vector(random, scale * c.force_noise);
+            wrench.torque += vector(random, scale * c.torque_noise);
+        }
         self.line.newest().copy_from(&self.fresh);
         self.line.advance();
     }
@@ -215,6 +242,11 @@ impl Sensors {
     /// Starts as if the present readings had been there for a long time.
     pub fn preset(&mut self) {
         self.line.fill(&self.fresh);
+    }
+
+    /// Which sensors there are, and how good.
+    pub fn config(&self) -> &SensorConfig {
+        &self.config
     }
 
     /// What the sensors say now, without delay: for a servo on the robot.
@@ -241,16 +273,16 @@ mod tests {
     use super::*;
 
     fn truth() -> Readings {
-        let mut truth = Readings::zeros(2);
+        let mut truth = Readings::zeros(2, 1);
         truth.position = vec![0.12345, -0.5];
         truth.velocity = vec![1.0, 2.0];
-        truth.stance_wrench.force.z = 1700.0;
+        truth.foot_wrench[0].force.z = 1700.0;
         truth
     }
 
     #[test]
     fn perfect_sensors_tell_the_truth() {
-        let mut sensors = Sensors::new(2, 1e-3, &SensorConfig::PERFECT, 3).unwrap();
+        let mut sensors = Sensors::new(2, 1, 1e-3, &SensorConfig::PERFECT, 3).unwrap();
         sensors.read(&truth());
         assert_eq!((sensors.told(), sensors.fresh()), (&truth(), &truth()));
     }
@@ -258,7 +290,7 @@ mod tests {
     #[test]
     fn noise_has_the_deviation_asked_for_and_bias_stays() {
         let config = SensorConfig { position_noise: 1e-3, position_bias: 0.1, ..SensorConfig::PERFECT };
-        let mut sensors = Sensors::new(2, 1e-3, &config, 5).unwrap();
+        let mut sensors = Sensors::new(2, 1, 1e-3, &config, 5).unwrap();
         let n = 20_000;
         let (mut sum, mut square) = (0.0, 0.0);
         for _ in 0..n {
@@ -276,7 +308,7 @@ mod tests {
     #[test]
     fn encoders_count_in_whole_steps() {
         let config = SensorConfig { position_resolution: 0.01, ..SensorConfig::PERFECT };
-        let mut sensors = Sensors::new(2, 1e-3, &config, 5).unwrap();
+        let mut sensors = Sensors::new(2, 1, 1e-3, &config, 5).unwrap();
         sensors.read(&truth());
         assert!((sensors.told().position[0] - 0.12).abs() < 1e-15);
     }
@@ -284,7 +316,7 @@ mod tests {
     #[test]
     fn what_is_told_is_old_and_carries_its_own_time() {
         let config = SensorConfig { delay: 3e-3, ..SensorConfig::PERFECT };
-        let mut sensors = Sensors::new(2, 1e-3, &config, 5).unwrap();
+        let mut sensors = Sensors::new(2, 1, 1e-3, &config, 5).unwrap();
         for k in 1..=5 {
             let mut now = truth();
             now.time_ns = k * 1_000_000;
@@ -297,7 +329,7 @@ mod tests {
     #[test]
     fn the_noisy_orientation_is_a_rotation() {
         let config = SensorConfig { base_orientation_noise: 0.1, ..SensorConfig::PERFECT };
-        let mut sensors = Sensors::new(2, 1e-3, &config, 5).unwrap();
+        let mut sensors = Sensors::new(2, 1, 1e-3, &config, 5).unwrap();
         sensors.read(&truth());
         let r = sensors.told().base_pose_w.rotation;
         assert!((r.tr_mul(&r) - nalgebra::Matrix3::identity()).amax() < 1e-14);

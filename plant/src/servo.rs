@@ -15,7 +15,7 @@
 //! Before the first command the static law holds, if there is one; else nothing does. Levels 2 and below are left after a number
 //! of good commands in a row.
 
-use delmpc_messages::{Command, FallbackLevel, MessageError, Verdict};
+use delmpc_messages::{Command, FallbackLevel, MessageError, RateMean, ServoReadings, Verdict};
 
 use crate::error::{PlantError, require, require_length};
 
@@ -156,6 +156,7 @@ pub struct Servo {
     refused: u64,
     taken: u64,
     newest_sequence: u64,
+    rates: RateMean,
 }
 
 impl Servo {
@@ -194,6 +195,7 @@ impl Servo {
             refused: 0,
             taken: 0,
             newest_sequence: 0,
+            rates: RateMean::default(),
         })
     }
 
@@ -247,8 +249,19 @@ impl Servo {
         }
     }
 
-    /// The torque asked for at plant time `now_ns`, for measured joints. O(n²), no allocation.
-    pub fn torque_into(&mut self, now_ns: u64, position: &[f64], velocity: &[f64], torque: &mut [f64]) {
+    /// The torque asked for at plant time `now_ns`, for what is measured then. O(n²), no allocation.
+    pub fn torque_into(&mut self, now_ns: u64, readings: &ServoReadings<'_>, torque: &mut [f64]) {
+        let ServoReadings { position, velocity, .. } = *readings;
+        let joints = self.joints.min(velocity.len());
+        let samples = self.active.map_or(1, |at| self.slots[at].command.rate_samples);
+        let rate = readings.imu.map_or([0.0; 3], |(_, rate)| rate);
+        let (velocities, rate) = self.rates.take(velocity, &rate, samples);
+        let (velocities, rate) = (*velocities, *rate);
+        let smooth = ServoReadings {
+            velocity: &velocities[..joints],
+            imu: readings.imu.map(|(angle, _)| (angle, rate)),
+            ..*readings
+        };
         self.promote(now_ns);
         self.level = self.level_at(now_ns);
         if self.active.is_some() {
@@ -258,7 +271,7 @@ impl Servo {
         match (self.level, slot, &self.config.law) {
             (FallbackLevel::ZeroTorque, None, _) => torque.fill(0.0),
             (level, Some(slot), _) if self.follows(level, now_ns) => {
-                if slot.command.torque_into(now_ns, position, velocity, torque).is_err() {
+                if slot.command.torque_into(now_ns, &smooth, torque).is_err() {
                     // Of another number of joints than this servo: no torque is right for it.
                     torque.fill(0.0);
                 }
@@ -390,7 +403,7 @@ mod tests {
 
     fn torque(servo: &mut Servo, now: u64) -> [f64; 2] {
         let mut out = [f64::NAN; 2];
-        servo.torque_into(now, &[0.1, 0.2], &[1.0, 1.0], &mut out);
+        servo.torque_into(now, &ServoReadings::joints(&[0.1, 0.2], &[1.0, 1.0]), &mut out);
         out
     }
 

@@ -1,12 +1,13 @@
-//! The ground: a horizontal plane, boxes on it, gaps in it.
+//! The ground: a plane, boxes on it, gaps in it; all of it may be tilted about the origin of {0}.
 //!
 //! ```text
+//! x = Sᵀ x_w                                               S: slope, from the axes of the ground to {0}
 //! plane   φ = z - height                                   (no plane inside a gap)
 //! box     φ = max over its six faces of n·(x - face)        negative inside; the face of the maximum is the active one
 //! ```
 //!
-//! A point sees the surface with the smallest `φ`, and the frame of that face stays the same during a step. The frame's rows are
-//! `t1, t2, n`, right-handed; on horizontal ground they are the axes of {0}.
+//! Boxes and gaps are given in the axes of the ground. A point sees the surface with the smallest `φ`, and the frame of that face stays
+//! the same during a step. The frame's rows are `t1, t2, n`, right-handed; on horizontal ground they are the axes of {0}.
 
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
@@ -39,6 +40,8 @@ pub struct Terrain {
     pub boxes: Vec<TerrainBox>,
     /// Gaps in the plane.
     pub gaps: Vec<TerrainGap>,
+    /// `S`.
+    pub slope: Matrix3<f64>,
 }
 
 impl Default for Terrain {
@@ -59,11 +62,24 @@ pub struct Surface {
 impl Terrain {
     /// A plane and nothing else.
     pub fn plane(height: f64) -> Self {
-        Self { plane_height: Some(height), boxes: Vec::new(), gaps: Vec::new() }
+        Self { plane_height: Some(height), boxes: Vec::new(), gaps: Vec::new(), slope: Matrix3::identity() }
     }
 
     /// The surface nearest to `x_w`; `None` when there is none at all below it.
     pub fn surface(&self, x_w: &Vector3<f64>) -> Option<Surface> {
+        if self.slope == Matrix3::identity() {
+            return self.surface_in_ground_axes(x_w);
+        }
+        let surface = self.surface_in_ground_axes(&self.slope.tr_mul(x_w));
+        surface.map(|surface| Surface { frame: surface.frame * self.slope.transpose(), ..surface })
+    }
+
+    /// Normal of the plane in {0}.
+    pub fn normal_w(&self) -> Vector3<f64> {
+        self.slope.column(2).into()
+    }
+
+    fn surface_in_ground_axes(&self, x_w: &Vector3<f64>) -> Option<Surface> {
         let mut nearest = self
             .plane_height
             .filter(|_| !self.in_gap(x_w))
@@ -77,7 +93,7 @@ impl Terrain {
         nearest
     }
 
-    /// Height of the highest ground below or at the place `(x, y)`, m.
+    /// Height of the highest ground below or at the place `(x, y)`, in the axes of the ground, m.
     pub fn height_at(&self, x: f64, y: f64) -> Option<f64> {
         let place = Vector3::new(x, y, 0.0);
         let tops = self.boxes.iter().filter(|block| block.covers(&place)).map(TerrainBox::top);
@@ -131,7 +147,7 @@ mod tests {
             yaw: 0.3,
         };
         let gap = TerrainGap { min: [-1.0, -1.0], max: [-0.5, 1.0] };
-        Terrain { plane_height: Some(0.0), boxes: vec![block], gaps: vec![gap] }
+        Terrain { boxes: vec![block], gaps: vec![gap], ..Terrain::plane(0.0) }
     }
 
     #[test]
@@ -159,6 +175,21 @@ mod tests {
             let moved = terrain.boxes[0].surface(&(x + here.frame.row(2).transpose() * 1e-3));
             assert!((moved.gap - here.gap - 1e-3).abs() < 1e-15);
         }
+    }
+
+    #[test]
+    fn a_slope_turns_everything_about_the_origin() {
+        let slope = *Rotation3::from_euler_angles(0.05, -0.1, 0.0).matrix();
+        let (flat, tilted) = (step(), Terrain { slope, ..step() });
+        for x in [[0.0, 0.0, 0.03], [1.0, 0.1, 0.25], [-0.7, 0.0, 0.1], [0.7, 0.1, 0.05]] {
+            let x = Vector3::from(x);
+            let (here, there) = (flat.surface(&x), tilted.surface(&(slope * x)));
+            assert_eq!(here.is_some(), there.is_some());
+            let Some((here, there)) = here.zip(there) else { continue };
+            assert!((here.gap - there.gap).abs() < 1e-15);
+            assert!((there.frame - here.frame * slope.transpose()).amax() < 1e-15);
+        }
+        assert!((tilted.normal_w() - slope * Vector3::z()).norm() < 1e-15);
     }
 
     #[test]

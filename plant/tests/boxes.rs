@@ -258,6 +258,7 @@ fn a_box_rests_on_a_box_and_falls_into_a_gap() {
         plane_height: Some(0.0),
         boxes: vec![step],
         gaps: vec![delmpc_plant::terrain::TerrainGap { min: [4.0, -1.0], max: [6.0, 1.0] }],
+        ..Terrain::default()
     };
     let points = corners(size, 0.6, false);
     for (x, landed) in [(0.0, Some(0.3)), (3.0, Some(0.1)), (5.0, None)] {

@@ -62,7 +62,7 @@ pub fn description(setup: &Setup) -> Value {
         "cycle_s": 1.0 / scenario.controller.mpc_rate_hz,
         "cop_margin_m": scenario.controller.constraints.cop_margin_m,
         "torque_fraction": scenario.controller.constraints.torque_fraction,
-        "ball": scenario.reach.as_ref().map(|reach| reach.ball_m),
+        "ball": setup.ball_w().ok().flatten(),
         "hand": hand.map(|hand| json!({"body": hand.body, "pose": pose(&hand.pose)})),
         "hand_limits_m": [scenario.success.hand_error_at_deadline_m, scenario.success.hand_error_hold_max_m],
         "events": events(setup),

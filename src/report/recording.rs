@@ -192,7 +192,7 @@ impl FrameBuilder {
             stride: stride as u64,
             frame_s: stride * scenario.plant.step_s,
             joints,
-            ball: scenario.reach.as_ref().map(|reach| reach.ball_m),
+            ball: setup.ball_w().ok().flatten(),
             feet: feet.collect(),
             table: widths.map(|(name, width)| (name, Column::new(width))).into(),
             steps: 0,

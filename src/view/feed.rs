@@ -6,7 +6,7 @@
 use std::fmt::Write as _;
 
 use delmpc_mechanics::prelude::{RigidTransform, Twist};
-use delmpc_messages::{Command, PlantState};
+use delmpc_messages::{Command, PlantState, foot};
 use delmpc_transport::{Channel, RunId, RunNode, SharedSubscriber, Subscriber};
 use nalgebra::{Quaternion, UnitQuaternion, Vector2, Vector3};
 
@@ -28,6 +28,7 @@ pub struct Feed {
     frames: FrameBuilder,
     polygon: Vec<Vector2<f64>>,
     pushes: Vec<(Vector3<f64>, f64, f64)>,
+    stance_foot: usize,
     truth: Truth,
     command: Option<Box<Command>>,
     next_ns: u64,
@@ -40,8 +41,10 @@ impl Feed {
     /// [`Failure::Fault`] when shared memory is unusable.
     pub fn new(setup: &Setup, run: RunId) -> Result<Self, Failure> {
         let node = RunNode::open(run, setup.joint_set_hash()).map_err(Failure::fault)?;
+        let stance_frame_w = setup.start()?.stance_frame_w;
         let pushes = setup.scenario.push.iter().filter(|push| push.impulse_ns > 0.0).map(|push| {
-            let force = Vector3::from(push.direction).normalize() * (push.impulse_ns / push.duration_s);
+            let direction_w = stance_frame_w.rotation * Vector3::from(push.direction).normalize();
+            let force = direction_w * (push.impulse_ns / push.duration_s);
             (force, push.start_s, push.start_s + push.duration_s)
         });
         let polygon = setup.robot.sole(&setup.scenario.robot.stance).map(|sole| sole.polygon.clone());
@@ -52,6 +55,7 @@ impl Feed {
             frames: FrameBuilder::new(setup),
             polygon: polygon.unwrap_or_default(),
             pushes: pushes.collect(),
+            stance_foot: setup.stance_foot(),
             truth: Truth::new(setup.robot.joint_names.len() as u32),
             command: None,
             next_ns: 0,
@@ -83,8 +87,8 @@ impl Feed {
     fn observe(&mut self, state: &PlantState, pull_w: [f64; 3]) {
         let joints = (state.n_joints as usize).min(state.position.len());
         let [x, y, z, w] = state.base_orientation_w;
-        let rotation =
-            UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)).to_rotation_matrix().into_inner();
+        let rotation = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-6).unwrap_or_default();
+        let rotation = rotation.to_rotation_matrix().into_inner();
         let base = RigidTransform { rotation, translation: state.base_position_w.into() };
         let twist = Twist::new(state.base_angular_velocity_b.into(), state.base_linear_velocity_b.into());
         let motion = Motion {
@@ -99,10 +103,13 @@ impl Feed {
         truth.time_ns = state.time_ns;
         truth.status_flags = state.status_flags;
         truth.watchdog_level = state.watchdog_level;
-        truth.contact_flags = self.frames.contacts_of_feet(state.contact_flags);
-        truth.stance_torque_b = state.stance_torque_b;
-        truth.stance_force_b = state.stance_force_b;
-        truth.cop_margin_m = pressure_point(&state.stance_torque_b, &state.stance_force_b)
+        let touching =
+            state.feet().iter().enumerate().filter(|(_, reading)| reading.flags & foot::TOUCHES != 0);
+        truth.contact_flags = self.frames.contacts_of_feet(touching.map(|(index, _)| 1 << index).sum());
+        let stance = state.feet().get(self.stance_foot);
+        truth.stance_torque_b = stance.map_or([0.0; 3], |reading| reading.torque_s);
+        truth.stance_force_b = stance.map_or([0.0; 3], |reading| reading.force_s);
+        truth.cop_margin_m = pressure_point(&truth.stance_torque_b, &truth.stance_force_b)
             .map_or(f64::NAN, |point| cop_margin_m(&self.polygon, &point));
         let time_s = truth.time_s();
         let acting = self.pushes.iter().filter(|(_, from_s, to_s)| (*from_s..*to_s).contains(&time_s));

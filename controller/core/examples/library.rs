@@ -7,7 +7,7 @@ use std::error::Error;
 
 use delmpc_controller_core::prelude::*;
 use delmpc_mechanics::prelude::*;
-use delmpc_messages::{PlantState, joint_set_hash};
+use delmpc_messages::{PlantState, ServoReadings, joint_set_hash};
 
 /// Brings the mass upright, and fails when it is not.
 pub fn main() -> Result<(), Box<dyn Error>> {
@@ -33,7 +33,8 @@ pub fn main() -> Result<(), Box<dyn Error>> {
         // The command is a feedback law: evaluate it as often as there are encoder readings.
         for servo_ns in (now_ns..now_ns + 5_000_000).step_by(1_000_000) {
             let (position, velocity) = real.encoders();
-            command.torque_into(servo_ns, &position, &velocity, &mut torque)?;
+            let readings = ServoReadings::joints(&position, &velocity);
+            command.torque_into(servo_ns, &readings, &mut torque)?;
             real.drive(&torque)?;
         }
     }

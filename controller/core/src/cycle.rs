@@ -20,7 +20,7 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use delmpc_mechanics::inverse_dynamics::InverseDynamicsWorkspace;
-use delmpc_messages::{Command, CycleReport, FallbackLevel, PlantState, Verdict};
+use delmpc_messages::{Command, CycleReport, FallbackLevel, MAX_RATE_SAMPLES, PlantState, Verdict};
 use faer::MatRef;
 use nalgebra::Vector3;
 
@@ -47,6 +47,7 @@ use crate::stop_watch::StopWatch;
 pub use crate::stop_watch::{Clock, StoppedClock};
 use crate::tasks::TaskTargets;
 use crate::trajectory::Trajectory;
+use crate::unloaded_leg::UnloadedLeg;
 
 mod goal;
 mod law_of_level;
@@ -85,6 +86,8 @@ const EARLIEST_PERIODS: f64 = 2.0;
 const MISMATCH_CYCLES: u32 = 5;
 /// Part of a new difference between planned and measured force that counts at once.
 const FORCE_SMOOTHING: f64 = 0.5;
+/// Time over which the servo takes the mean of velocities, s.
+const RATE_MEAN_S: f64 = 0.004;
 /// Distance of any joint from the home posture up to which the static LQR is trusted, rad or m.
 const LQR_REACH: f64 = 0.6;
 
@@ -95,6 +98,7 @@ pub struct Controller {
     config: ControllerConfig,
 
     estimator: Estimator,
+    unloaded_leg: Option<UnloadedLeg>,
     ladder: FallbackLadder,
     reference: Reference,
     trim: BalanceTrim,
@@ -135,6 +139,8 @@ pub struct Controller {
     force_change: Vector3<f64>,
 
     static_law: Law,
+    /// What the pressure point left of the torque in the last fresh plan: torque, lower and upper bounds.
+    last_bounds: [Vec<f64>; 3],
     /// The law in the last command, and those before.
     law: Law,
     past_laws: LawHistory,
@@ -186,9 +192,25 @@ impl Controller {
             .map_err(|_| ControlError::Model { reason: "the QP solver refused its set-up" })?;
         let mut command = Command::new(0, model.joint_set_hash, n as u32);
         command.fallback_level = FallbackLevel::ZeroTorque as u32;
+        let samples = libm::round(RATE_MEAN_S / config.servo_period_s) as usize;
+        command.rate_samples = samples.clamp(1, MAX_RATE_SAMPLES) as u32;
         let plan = Plan::new(Trajectory::new(size), &config.stage_lengths());
+        let unloaded_leg = match &model.sensing {
+            Some(sensing) => match sensing.rerooted.new_body(0) {
+                Some(base) => Some(UnloadedLeg::new(
+                    tree,
+                    sensing.stance_foot,
+                    base,
+                    &model.posture,
+                    config.servo_period_s,
+                )?),
+                None => None,
+            },
+            None => None,
+        };
         let mut controller = Self {
-            estimator: Estimator::new(&model),
+            estimator: Estimator::new(&model)?,
+            unloaded_leg,
             ladder: FallbackLadder::new(config.fallback),
             reference: Reference { home, reach: None, com_shift: Vector3::zeros() },
             trim: BalanceTrim::new(config.trim_s),
@@ -207,7 +229,7 @@ impl Controller {
             cycle_began_ns: 0,
             preparations_ns: [0; 3],
             factors_start_s: 0.0,
-            prediction: Prediction::new(tree, config.servo_period_s),
+            prediction: Prediction::new(tree, config.servo_period_s, command.rate_samples),
             predicted: vec![0.0; 2 * n],
             predicted_for_s: 0.0,
             has_prediction: false,
@@ -217,6 +239,7 @@ impl Controller {
             planned_force: None,
             force_change: Vector3::zeros(),
             static_law: Law::new(n),
+            last_bounds: [vec![0.0; n], vec![f64::NEG_INFINITY; n], vec![f64::INFINITY; n]],
             law: Law::new(n),
             past_laws: LawHistory::new(n, config.delay_s, config.period_s),
             blank_report: command.report,
@@ -360,17 +383,18 @@ impl Controller {
         self.last_state_ns = Some(state.time_ns);
         self.last_sequence = state.header.sequence;
 
-        let measured = Vector3::from(state.stance_force_b);
-        // A force of zero is one that is not measured.
-        let planned = self.planned_force.filter(|_| measured != Vector3::zeros());
-        let change = planned.map_or(Vector3::zeros(), |planned| measured - planned);
+        let wrench = self.estimator.estimate().stance_wrench;
+        let change = self.planned_force.zip(wrench).map(|(planned, wrench)| wrench.force - planned);
+        let change = change.unwrap_or_default();
         self.force_change += FORCE_SMOOTHING * (change - self.force_change);
 
         let measured_s = self.run_time_s(state.time_ns);
         self.reference.com_shift = Vector3::zeros();
         self.reference.sample(measured_s, &mut self.targets);
-        let (torque, rates) = (Vector3::from(state.stance_torque_b), &self.estimator.estimate().q_dot);
-        self.trim.update(&self.targets.com, &torque, &measured, rates, since_last_s);
+        if let Some(wrench) = wrench {
+            let rates = &self.estimator.estimate().q_dot;
+            self.trim.update(&self.targets.com, &wrench.torque, &wrench.force, rates, since_last_s);
+        }
         self.reference.com_shift = self.trim.shift();
         self.test_innovation(measured_s);
         let Estimate { q, q_dot, .. } = self.estimator.estimate();
@@ -554,6 +578,11 @@ impl Controller {
     /// Estimate from the last good measurement.
     pub fn estimate(&self) -> &Estimate {
         self.estimator.estimate()
+    }
+
+    /// What is believed of base and feet.
+    pub fn estimator(&self) -> &Estimator {
+        &self.estimator
     }
 
     /// Root mean square of the last innovation of the joint rates, rad/s.

@@ -1,24 +1,33 @@
 //! From a measurement to the state of the foot-rooted model.
 //!
-//! The joints of the foot-rooted tree are the measured joints in another order (see `delmpc_mechanics::reroot`), so `(q, q̇)` is a
-//! permutation. The measured base pose says, through the floating kinematics, where the stance sole is: its change since the first
-//! measurement is slip and tilt, which the model takes to be zero and the report does not hide.
+//! The joints of the foot-rooted tree are the measured joints in another order (see `delmpc_mechanics::reroot`). Base and feet come from
+//! `delmpc_estimation`; what they say of how the robot leans replaces what the stance ankle's encoders say ([`crate::level_stance`]).
+//! A robot without an inertial unit, or one bolted to the ground, has its encoders only, and its stance foot is taken to be level.
 
 use alloc::vec;
 use alloc::vec::Vec;
 
-use delmpc_mechanics::errors::ModelError;
-use delmpc_mechanics::kinematics::{Configuration, Kinematics, base_pose_from_link};
-use delmpc_mechanics::spatial::{RigidTransform, log_rotation};
-use delmpc_messages::PlantState;
-use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+use delmpc_estimation::prelude::{
+    BaseEstimate, EstimationError, Estimator as BaseEstimator, FootEstimate, FootMeasurement, Inertial,
+    Measurement,
+};
+use delmpc_mechanics::spatial::{RigidTransform, Twist, Wrench};
+use delmpc_messages::{MAX_FEET, PlantState, foot, sensor};
+use nalgebra::{Quaternion, UnitQuaternion, Vector2, Vector3};
 
+use crate::errors::ControlError;
+use crate::level_stance::LevelStance;
 use crate::model::ControllerModel;
+
+/// Time in which the lean of a firmly loaded foot becomes that of the ground, s.
+const GROUND_LEAN_S: f64 = 0.2;
+/// A foot is firmly loaded when its pressure point is farther than this from its edge, m.
+const FIRM_MARGIN_M: f64 = 0.01;
 
 /// The state the controller believes in.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Estimate {
-    /// Joint coordinates in the order of the foot-rooted tree.
+    /// Joint coordinates in the order of the foot-rooted tree; the stance ankle's are those of a level foot.
     pub q: Vec<f64>,
     /// Joint rates.
     pub q_dot: Vec<f64>,
@@ -26,59 +35,190 @@ pub struct Estimate {
     pub slip_m: f64,
     /// How far it has tilted from where it first was, rad.
     pub tilt_rad: f64,
+    /// Wrench of the ground on the stance foot about the sole's origin, in the level {0}; `None`: not measured.
+    pub stance_wrench: Option<Wrench>,
+    /// Whether the stance foot carries load.
+    pub stance_loaded: bool,
+    /// Encoders of the ankle joints less those of the level foot, as they are when the foot lies on the ground, rad.
+    pub ground_lean: Vector2<f64>,
 }
 
 /// Workspace of the estimator.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub struct Estimator {
     estimate: Estimate,
-    floating: Option<Kinematics>,
+    base: Option<BaseEstimator>,
+    level: Option<LevelStance>,
+    /// Whether the state was levelled at the last measurement.
+    levelled: bool,
     first_sole_w: Option<RigidTransform>,
+    last_s: Option<f64>,
+    imu_angle: Option<Vector3<f64>>,
 }
 
 impl Estimator {
     /// For a model.
-    pub fn new(model: &ControllerModel) -> Self {
-        let n = model.tree.dof();
-        Self {
-            estimate: Estimate { q: vec![0.0; n], q_dot: vec![0.0; n], slip_m: 0.0, tilt_rad: 0.0 },
-            floating: model.stance.as_ref().map(|stance| Kinematics::new(&stance.floating)),
-            first_sole_w: None,
-        }
-    }
-
-    /// Takes a validated measurement in.
     ///
     /// # Errors
-    /// [`ModelError::Length`] when the model's parts do not fit each other.
-    pub fn update(&mut self, model: &ControllerModel, state: &PlantState) -> Result<(), ModelError> {
-        let Estimate { q, q_dot, slip_m, tilt_rad } = &mut self.estimate;
-        for (i, &joint) in model.message_joint.iter().enumerate() {
-            q[i] = state.position[joint];
-            q_dot[i] = state.velocity[joint];
+    /// [`ControlError`] when the parts of its sensing do not fit each other.
+    pub fn new(model: &ControllerModel) -> Result<Self, ControlError> {
+        let n = model.tree.dof();
+        let (mut base, mut level) = (None, None);
+        if let Some(sensing) = &model.sensing {
+            let estimator = BaseEstimator::new(sensing.estimator.clone(), sensing.config);
+            base = Some(estimator.map_err(|_| ControlError::Model {
+                reason: "a foot or the inertial unit is on a body the floating tree does not have",
+            })?);
+            if let Some(body) = sensing.rerooted.new_body(sensing.estimator.imu_body) {
+                level = LevelStance::new(&model.tree, body, &model.posture)?;
+            }
         }
-        if let (Some(stance), Some(kinematics)) = (&model.stance, &mut self.floating) {
-            let [x, y, z, w] = state.base_orientation_w;
-            let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
-            let link = RigidTransform {
-                rotation: rotation.to_rotation_matrix().into_inner(),
-                translation: Vector3::from(state.base_position_w),
-            };
-            let base = base_pose_from_link(&stance.floating, &link);
-            let joints = &state.position[..stance.floating.joint_count()];
-            kinematics.update_positions(&stance.floating, &Configuration::floating(base, joints))?;
-            let sole = stance.rerooted.frame_pose_w(kinematics);
-            let first = self.first_sole_w.get_or_insert(sole);
-            let moved = sole.translation - first.translation;
-            *slip_m = libm::sqrt(moved.x * moved.x + moved.y * moved.y);
-            let turned = log_rotation(&(sole.rotation * first.rotation.transpose()));
-            *tilt_rad = libm::sqrt(turned.x * turned.x + turned.y * turned.y);
+        Ok(Self {
+            estimate: Estimate {
+                q: vec![0.0; n],
+                q_dot: vec![0.0; n],
+                slip_m: 0.0,
+                tilt_rad: 0.0,
+                stance_wrench: None,
+                stance_loaded: true,
+                ground_lean: Vector2::zeros(),
+            },
+            base,
+            level,
+            levelled: false,
+            first_sole_w: None,
+            last_s: None,
+            imu_angle: None,
+        })
+    }
+
+    /// Takes a validated measurement in. No allocation.
+    ///
+    /// # Errors
+    /// [`EstimationError`] when the model's parts do not fit each other, or the filter diverged.
+    pub fn update(&mut self, model: &ControllerModel, state: &PlantState) -> Result<(), EstimationError> {
+        for (i, &joint) in model.message_joint.iter().enumerate() {
+            self.estimate.q[i] = state.position[joint];
+            self.estimate.q_dot[i] = state.velocity[joint];
+        }
+        self.levelled = false;
+        self.imu_angle = state
+            .has_sensor(sensor::INERTIAL_UNIT | sensor::INERTIAL_SUMS)
+            .then(|| Vector3::from(state.imu_angle));
+        let (Some(sensing), Some(base)) = (&model.sensing, &mut self.base) else { return Ok(()) };
+        let stance = sensing.stance_foot;
+        let reading = state.feet().get(stance).filter(|reading| reading.flags & foot::WRENCH != 0);
+        self.estimate.stance_wrench =
+            reading.map(|reading| Wrench::new(reading.torque_s.into(), reading.force_s.into()));
+
+        let mut feet = [FootMeasurement::default(); MAX_FEET];
+        for (out, reading) in feet.iter_mut().zip(state.feet()) {
+            let wrench = || Wrench::new(reading.torque_s.into(), reading.force_s.into());
+            out.wrench_s = (reading.flags & foot::WRENCH != 0).then(wrench);
+            out.touches = reading.flags & foot::TOUCHES != 0;
+        }
+        let count = sensing.estimator.tree.joint_count();
+        base.update(&Measurement {
+            time_s: state.time_ns as f64 * 1e-9,
+            position: &state.position[..count],
+            velocity: &state.velocity[..count],
+            inertial: inertial(state),
+            feet: &feet[..state.feet().len()],
+            motion_capture: motion_capture(state),
+        })?;
+        self.level_stance(model)?;
+        self.observe_sole(model, state.time_ns as f64 * 1e-9);
+        Ok(())
+    }
+
+    /// The ankle of a level foot, and the wrench in level axes.
+    fn level_stance(&mut self, model: &ControllerModel) -> Result<(), EstimationError> {
+        let (Some(sensing), Some(base), Some(level)) = (&model.sensing, &self.base, &mut self.level) else {
+            return Ok(());
+        };
+        let believed = base.estimate();
+        if !believed.attitude_is_measured {
+            return Ok(());
+        }
+        let mounting = &sensing.estimator.imu_mounting.rotation;
+        // Axes of the link the unit sits on.
+        let link_w = believed.imu_rotation_w * mounting.transpose();
+        let rate = mounting * base.imu_rate();
+        let up = link_w.row(2).transpose();
+        let Estimate { q, q_dot, stance_wrench, .. } = &mut self.estimate;
+        self.levelled = level.level(&model.tree, &up, &rate, q, q_dot)?;
+        if let Some(wrench) = stance_wrench.as_mut().filter(|_| self.levelled) {
+            let turn = level.sole_rotation();
+            *wrench = Wrench::new(turn * wrench.torque, turn * wrench.force);
         }
         Ok(())
+    }
+
+    /// Slip, tilt and load of the sole, and how the ground under it leans.
+    fn observe_sole(&mut self, model: &ControllerModel, time_s: f64) {
+        let (Some(sensing), Some(base)) = (&model.sensing, &self.base) else { return };
+        let Some(foot) = base.feet().get(sensing.stance_foot) else { return };
+        let estimate = &mut self.estimate;
+        let first = self.first_sole_w.get_or_insert(foot.sole_pose_w);
+        let moved = foot.sole_pose_w.translation - first.translation;
+        estimate.slip_m = libm::hypot(moved.x, moved.y);
+        let (up, was): (Vector3<f64>, Vector3<f64>) =
+            (foot.sole_pose_w.rotation.column(2).into(), first.rotation.column(2).into());
+        estimate.tilt_rad = libm::atan2(up.cross(&was).norm(), up.dot(&was));
+        estimate.stance_loaded = foot.loaded || estimate.stance_wrench.is_none();
+        if let Some(level) = self.level.as_ref().filter(|_| self.levelled) {
+            match self.last_s {
+                None => estimate.ground_lean = level.lean(),
+                Some(last_s) if foot.loaded && foot.margin > FIRM_MARGIN_M => {
+                    let share = ((time_s - last_s) / GROUND_LEAN_S).clamp(0.0, 1.0);
+                    estimate.ground_lean += (level.lean() - estimate.ground_lean) * share;
+                }
+                Some(_) => {}
+            }
+        }
+        self.last_s = Some(time_s);
     }
 
     /// The last estimate.
     pub fn estimate(&self) -> &Estimate {
         &self.estimate
     }
+
+    /// Base and biases; `None` without sensing.
+    pub fn base(&self) -> Option<&BaseEstimate> {
+        self.base.as_ref().map(BaseEstimator::estimate)
+    }
+
+    /// The feet in the order of the messages; empty without sensing.
+    pub fn feet(&self) -> &[FootEstimate] {
+        self.base.as_ref().map_or(&[], BaseEstimator::feet)
+    }
+
+    /// The levelled stance foot, when the last measurement was levelled, and the gyroscope's sum, when there is one.
+    pub(crate) fn levelled(&self) -> Option<(&LevelStance, Option<Vector3<f64>>)> {
+        self.level.as_ref().filter(|_| self.levelled).map(|level| (level, self.imu_angle))
+    }
+}
+
+fn inertial(state: &PlantState) -> Option<Inertial> {
+    state.has_sensor(sensor::INERTIAL_UNIT).then(|| Inertial {
+        angular_velocity: state.imu_angular_velocity.into(),
+        specific_force: state.imu_specific_force.into(),
+        sums: state
+            .has_sensor(sensor::INERTIAL_SUMS)
+            .then(|| (state.imu_angle.into(), state.imu_velocity.into())),
+    })
+}
+
+fn motion_capture(state: &PlantState) -> Option<(RigidTransform, Twist)> {
+    state.has_sensor(sensor::MOTION_CAPTURE).then(|| {
+        let [x, y, z, w] = state.base_orientation_w;
+        let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+        let pose = RigidTransform {
+            rotation: rotation.to_rotation_matrix().into_inner(),
+            translation: Vector3::from(state.base_position_w),
+        };
+        let twist = Twist::new(state.base_angular_velocity_b.into(), state.base_linear_velocity_b.into());
+        (pose, twist)
+    })
 }

@@ -254,6 +254,8 @@ pub(crate) fn write_law(law: &Law, message_joint: &[usize], command: &mut Comman
 
 #[cfg(test)]
 mod tests {
+    use delmpc_messages::ServoReadings;
+
     use super::*;
 
     #[test]
@@ -311,7 +313,9 @@ mod tests {
         for ms in [0, 3, 9, 10, 15, 20, 60] {
             law.torque_at(1e-3 * f64::from(ms), &x, &mut error, &mut torque);
             let mut message = [0.0; 2];
-            command.torque_into(1_000_000 * ms as u64, &[x[1], x[0]], &[x[3], x[2]], &mut message).unwrap();
+            let (position, velocity) = ([x[1], x[0]], [x[3], x[2]]);
+            let readings = ServoReadings::joints(&position, &velocity);
+            command.torque_into(1_000_000 * ms as u64, &readings, &mut message).unwrap();
             let difference = (torque[0] - message[1]).abs() + (torque[1] - message[0]).abs();
             assert!(difference < 1e-12, "{ms} ms: {torque:?} and {message:?}");
         }

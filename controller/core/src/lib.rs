@@ -13,7 +13,7 @@
 //!
 //! Reading order: [`model`], [`config`], [`cycle`]; then in the order of the cycle [`estimator`], [`plan`], [`horizon_dynamics`], [`stage_dynamics`],
 //! [`node_kinematics`], [`tasks`], [`mod@reference`], [`contact_wrench`], [`lq_problem`], [`riccati`], [`dare`], [`projected_qp`],
-//! [`dual_qp`], [`fallback`]. Files without public items: `feedback_law.rs` (what a command carries), `balance_trim.rs` (wrong masses), `prediction.rs` (delay).
+//! [`dual_qp`], [`fallback`]. Files without public items: `feedback_law.rs` (what a command carries), `level_stance.rs` (a foot that is not level), `unloaded_leg.rs` (one that carries nothing), `balance_trim.rs` (wrong masses), `prediction.rs` (delay).
 #![allow(clippy::needless_range_loop)]
 #![cfg_attr(not(feature = "std"), no_std)]
 #![forbid(unsafe_code)]
@@ -40,6 +40,7 @@ mod feedback_law;
 pub mod horizon_dynamics;
 mod horizon_problem;
 pub(crate) mod kernels;
+mod level_stance;
 pub mod lq_problem;
 pub mod lq_stage;
 pub mod model;
@@ -57,13 +58,14 @@ pub mod stage_dynamics;
 mod stop_watch;
 pub mod tasks;
 pub mod trajectory;
+mod unloaded_leg;
 
 /// What a process needs to run a controller.
 pub mod prelude {
     pub use crate::config::{ConstraintConfig, ControllerConfig, ControllerKind, StageBlock};
     pub use crate::cycle::{Clock, Controller, StoppedClock};
     pub use crate::errors::ControlError;
-    pub use crate::model::{BodyPoint, ControllerModel, JointLimits, StanceObservation};
+    pub use crate::model::{BodyPoint, ControllerModel, JointLimits, Sensing};
     pub use crate::reference::Reach;
     pub use crate::tasks::TaskWeights;
 }

@@ -2,6 +2,7 @@
 
 use alloc::vec::Vec;
 
+use delmpc_estimation::prelude::{EstimatorConfig, EstimatorModel};
 use delmpc_mechanics::reroot::Rerooted;
 use delmpc_mechanics::tree::KinematicTree;
 use delmpc_messages::MAX_JOINTS;
@@ -31,12 +32,16 @@ pub struct JointLimits {
     pub velocity: f64,
 }
 
-/// The floating robot that the measured base belongs to; without it slip and tilt of the foot are not observed.
+/// What the robot's sensors tell of its base and feet, and where they sit; without it the stance foot is taken to be level and at rest.
 #[derive(Clone, Debug)]
-pub struct StanceObservation {
-    /// The floating tree.
-    pub floating: KinematicTree,
-    /// The same robot fixed at the stance sole.
+pub struct Sensing {
+    /// The floating robot, its inertial unit and its feet, in the order of the messages.
+    pub estimator: EstimatorModel,
+    /// How good the sensors are.
+    pub config: EstimatorConfig,
+    /// Which of the feet is the stance foot.
+    pub stance_foot: usize,
+    /// The robot fixed at the stance sole.
     pub rerooted: Rerooted,
 }
 
@@ -59,8 +64,8 @@ pub struct ControllerModel {
     pub swing_foot: Option<BodyPoint>,
     /// Home posture.
     pub posture: Vec<f64>,
-    /// Where the measured base leads to the stance foot.
-    pub stance: Option<StanceObservation>,
+    /// What is felt of base and feet.
+    pub sensing: Option<Sensing>,
 }
 
 impl ControllerModel {
@@ -74,8 +79,8 @@ impl ControllerModel {
         posture: Vec<f64>,
     ) -> Self {
         let message_joint = (0..tree.dof()).collect();
-        let (hand, swing_foot, stance) = (None, None, None);
-        Self { tree, message_joint, joint_set_hash, limits, sole, hand, swing_foot, posture, stance }
+        let (hand, swing_foot, sensing) = (None, None, None);
+        Self { tree, message_joint, joint_set_hash, limits, sole, hand, swing_foot, posture, sensing }
     }
 
     /// Message indices of the joints of a re-rooted tree.

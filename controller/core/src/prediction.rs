@@ -8,6 +8,8 @@
 //! q⁺ = q + Δt q̇ + ½ Δt² q̈        q̇⁺ = q̇ + Δt q̈
 //! ```
 //!
+//! The laws see velocities as the servo does, as means over its last samples: half their time behind.
+//!
 //! Midpoint rule in position and damping, which may be strong; explicit in the velocity that `c` depends on, of first order there. Over
 //! some milliseconds that costs less accuracy than sensors have, and a third of the time of variational steps. The plan itself is made of
 //! those.
@@ -39,11 +41,15 @@ pub(crate) struct Prediction {
     error: Vec<f64>,
     /// Torque, then acceleration.
     acceleration: Vec<f64>,
+    /// By how much the velocities a law sees are behind, s: those of the servo are means.
+    rate_lag_s: f64,
+    /// The state as a law sees it.
+    seen: Vec<f64>,
 }
 
 impl Prediction {
     /// For a tree with a fixed base.
-    pub fn new(tree: &KinematicTree, servo_period_s: f64) -> Self {
+    pub fn new(tree: &KinematicTree, servo_period_s: f64, rate_samples: u32) -> Self {
         let n = tree.dof();
         Self {
             servo_period_s,
@@ -54,6 +60,8 @@ impl Prediction {
             factor: MassMatrixFactor::new(tree),
             error: vec![0.0; 2 * n],
             acceleration: vec![0.0; n],
+            rate_lag_s: 0.5 * f64::from(rate_samples.saturating_sub(1)) * servo_period_s,
+            seen: vec![0.0; 2 * n],
         }
     }
 
@@ -74,7 +82,13 @@ impl Prediction {
         let time_step = duration_s / steps;
         for step in 0..steps as usize {
             let (elapsed_s, law) = laws.at(from_s + step as f64 * time_step);
-            law.torque_at(elapsed_s, x, &mut self.error, &mut self.acceleration);
+            // The acceleration of the step before; of the last prediction at first.
+            let n = self.acceleration.len();
+            self.seen.copy_from_slice(x);
+            for (rate, acceleration) in self.seen[n..].iter_mut().zip(&self.acceleration) {
+                *rate -= self.rate_lag_s * acceleration;
+            }
+            law.torque_at(elapsed_s, &self.seen, &mut self.error, &mut self.acceleration);
             self.step(tree, time_step, x)?;
         }
         Ok(())
@@ -154,7 +168,7 @@ mod tests {
 
         let error = |servo_period_s: f64| {
             let mut x = start;
-            Prediction::new(&tree, servo_period_s).advance(&tree, &laws, 0.0, 0.005, &mut x).unwrap();
+            Prediction::new(&tree, servo_period_s, 1).advance(&tree, &laws, 0.0, 0.005, &mut x).unwrap();
             let part =
                 |range: core::ops::Range<usize>| range.map(|i| (x[i] - end[i]).abs()).fold(0.0, f64::max);
             (part(0..2), part(2..4))

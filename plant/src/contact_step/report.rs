@@ -32,6 +32,26 @@ pub struct ContactOptions {
     pub max_candidates: usize,
     /// Most point forces (pushes) in a step.
     pub max_pushes: usize,
+    /// How the ground gives.
+    pub ground: GroundGive,
+}
+
+/// Spring and damper of the ground under every contact point, along the normal.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GroundGive {
+    /// `k`, N/m; infinite: rigid.
+    pub stiffness: f64,
+    /// `d`, N s/m.
+    pub damping: f64,
+}
+
+impl GroundGive {
+    /// Ground that does not give.
+    pub const RIGID: Self = Self { stiffness: f64::INFINITY, damping: 0.0 };
+
+    pub(super) fn is_rigid(&self) -> bool {
+        self.stiffness == f64::INFINITY
+    }
 }
 
 impl Default for ContactOptions {
@@ -44,6 +64,7 @@ impl Default for ContactOptions {
             tolerance: 1e-7,
             max_candidates: 16,
             max_pushes: 4,
+            ground: GroundGive::RIGID,
         }
     }
 }

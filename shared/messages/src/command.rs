@@ -6,8 +6,8 @@ use iceoryx2::prelude::ZeroCopySend;
 
 use crate::header::message;
 use crate::{
-    ConstraintKind, CycleReport, Header, LARGEST_COORDINATE, LARGEST_EFFORT, MAX_JOINTS, Message,
-    MessageError, check,
+    ConstraintKind, CycleReport, Header, LARGEST_COORDINATE, LARGEST_EFFORT, MAX_FEET, MAX_JOINTS,
+    MAX_RATE_SAMPLES, Message, MessageError, check,
 };
 
 /// Capacity for the segments of a [`Command`].
@@ -19,7 +19,7 @@ pub const MAX_SEGMENTS: usize = 8;
 /// on its way is not held back by where it was.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
-#[cfg_attr(feature = "shared_memory", derive(ZeroCopySend), type_name("delmpc/Segment/v1"))]
+#[cfg_attr(feature = "shared_memory", derive(ZeroCopySend), type_name("delmpc/Segment/v2"))]
 pub struct Segment {
     /// When it begins, after `valid_from_ns` of the command (ns); 0 for the first one.
     pub begin_ns: u64,
@@ -35,19 +35,27 @@ pub struct Segment {
     pub velocity_ref: [f64; MAX_JOINTS],
     /// Reference joint acceleration (rad/s² or m/s²).
     pub acceleration_ref: [f64; MAX_JOINTS],
+    /// Reference of [`crate::PlantState::imu_angle`] at `begin_ns` (rad).
+    pub imu_angle_ref: [f64; 3],
+    /// Reference of the gyroscope less its bias at `begin_ns` (rad/s).
+    pub imu_rate_ref: [f64; 3],
+    /// Rate of change of `imu_rate_ref` (rad/s²).
+    pub imu_acceleration_ref: [f64; 3],
 }
 
 /// The answer to one [`crate::PlantState`]: an affine feedback law along a piece of the plan.
 ///
-/// The plant applies, at its own rate, `u = torque + gain [q - q_ref(t); q_dot - q_dot_ref(t)]` between `torque_lower`
-/// and `torque_upper` of the segment in force ([`Self::torque_into`]), then its limits. A command is meant for the time up to the next
-/// one, mostly within its first segment. The segments after that are what the controller would do if no other came: a torque that is
-/// right for 5 ms throws the robot over when it is held for 20, and commands do come late. The bounds keep what the feedback adds
-/// between two commands within what the controller found admissible: those of the stance ankle keep the pressure point in the sole
-/// while the robot is being pushed.
+/// The plant evaluates it at its own rate, with the sensors it reads at that rate ([`Self::torque_into`] says how), then keeps to its own
+/// limits. A command is meant for the time up to the next one, mostly within its first segment. The segments after that are what the
+/// controller would do if no other came: a torque that is right for 5 ms throws the robot over when it is held for 20, and commands do
+/// come late. The bounds keep what the feedback adds between two commands within what the controller found admissible: those of the
+/// stance ankle keep the pressure point in the sole while the robot is being pushed.
+///
+/// The ankle of a foot on the ground is told by the inertial unit, not by its encoder: an encoder there says how the foot rocks as much
+/// as how the robot leans. And what the ankle may do depends on what the foot carries: `load_foot` and the three fields after it.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
-#[cfg_attr(feature = "shared_memory", derive(ZeroCopySend), type_name("delmpc/Command/v3"))]
+#[cfg_attr(feature = "shared_memory", derive(ZeroCopySend), type_name("delmpc/Command/v4"))]
 pub struct Command {
     /// Type, joint set, run, sequence.
     pub header: Header,
@@ -69,18 +77,53 @@ pub struct Command {
     pub reason: u32,
     /// Segments in use, the first ones of `segments`, at least one.
     pub n_segments: u32,
-    /// Zero.
-    pub reserved: u32,
+    /// How many of the servo's last samples the velocities of the law are means of: 1 to [`crate::MAX_RATE_SAMPLES`].
+    pub rate_samples: u32,
     /// What to do when, in the order of time.
     pub segments: [Segment; MAX_SEGMENTS],
     /// Gain rows, one per joint. Column `j` multiplies the position error of joint j, column `MAX_JOINTS + j` its velocity error,
     /// whatever `n_joints` is.
     pub gain: [[f64; 2 * MAX_JOINTS]; MAX_JOINTS],
+    /// Gain rows on the inertial unit, one per joint: three columns on the error of `imu_angle`, three on that of the gyroscope.
+    pub imu_gain: [[f64; 6]; MAX_JOINTS],
+    /// Bias of the gyroscope (rad/s).
+    pub imu_rate_bias: [f64; 3],
+    /// For every joint, 1 + the foot whose load its torque needs; 0: none.
+    pub load_foot: [u32; MAX_JOINTS],
+    /// Normal force at which such a joint has its full torque, by foot (N).
+    pub full_load_n: [f64; MAX_FEET],
+    /// Stiffness with which such a joint holds `position_ref` while its foot carries nothing (N m/rad).
+    pub unloaded_stiffness: [f64; MAX_JOINTS],
+    /// Damping of the same (N m s/rad).
+    pub unloaded_damping: [f64; MAX_JOINTS],
     /// How the cycle went.
     pub report: CycleReport,
+    /// What the controller believes of the base at `state_time_ns`.
+    pub estimate: StateEstimate,
 }
 
-message!(Command, "delmpc/Command/v3", b"DMCO", 3);
+message!(Command, "delmpc/Command/v4", b"DMCO", 4);
+
+/// What a controller believes of base and feet: for logs and figures, nobody acts on it.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+#[cfg_attr(feature = "shared_memory", derive(ZeroCopySend), type_name("delmpc/StateEstimate/v1"))]
+pub struct StateEstimate {
+    /// 1: there is an estimate; 0: the controller has none.
+    pub known: u32,
+    /// Bit i: foot i is believed to carry load.
+    pub feet_loaded: u32,
+    /// Orientation of the base link frame in a level frame: quaternion x, y, z, w.
+    pub base_orientation_w: [f64; 4],
+    /// Angular velocity of the base link in its own axes (rad/s).
+    pub base_angular_velocity_b: [f64; 3],
+    /// Velocity of the origin of the base link frame in the axes of the base link (m/s).
+    pub base_linear_velocity_b: [f64; 3],
+    /// Bias of the gyroscope in its axes (rad/s).
+    pub gyro_bias: [f64; 3],
+    /// Bias of the accelerometer in its axes (m/s²).
+    pub accelerometer_bias: [f64; 3],
+}
 
 /// Outcome of a control cycle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -159,6 +202,15 @@ impl Segment {
                 check::plausible_one(message, field, place(joint), value, limit)?;
             }
         }
+        for (field, values) in [
+            ("imu_angle_ref", &self.imu_angle_ref),
+            ("imu_rate_ref", &self.imu_rate_ref),
+            ("imu_acceleration_ref", &self.imu_acceleration_ref),
+        ] {
+            for (axis, &value) in values.iter().enumerate() {
+                check::plausible_one(message, field, 3 * index + axis, value, LARGEST_EFFORT)?;
+            }
+        }
         for (joint, (lower, upper)) in self.torque_lower[..n].iter().zip(&self.torque_upper).enumerate() {
             if lower > upper {
                 let (index, lower, upper) = (place(joint), *lower, *upper);
@@ -182,6 +234,7 @@ impl Command {
             n_joints,
             fallback_level: FallbackLevel::ZeroTorque as u32,
             n_segments: 1,
+            rate_samples: 1,
             segments: [free; MAX_SEGMENTS],
             ..Self::zeroed()
         }
@@ -209,6 +262,9 @@ impl Command {
         if !(1..=MAX_SEGMENTS).contains(&count) {
             return Err(MessageError::WrongSegmentCount { message, found: count, capacity: MAX_SEGMENTS });
         }
+        let samples = self.rate_samples as usize;
+        let known = (1..=MAX_RATE_SAMPLES).contains(&samples).then_some(());
+        check::known(message, "rate_samples", self.rate_samples, known)?;
         let mut earliest_ns = 0;
         for (index, segment) in self.segments[..count].iter().enumerate() {
             let begin_ns = segment.begin_ns;
@@ -225,7 +281,30 @@ impl Command {
             }
         }
 
+        for (row, gain) in self.imu_gain[..n].iter().enumerate() {
+            for (column, &value) in gain.iter().enumerate() {
+                check::plausible_one(message, "imu_gain", 6 * row + column, value, LARGEST_EFFORT)?;
+            }
+        }
+        if let Some(&foot) = self.load_foot[..n].iter().find(|foot| **foot as usize > MAX_FEET) {
+            return Err(MessageError::TooManyFeet { message, found: foot as usize, capacity: MAX_FEET });
+        }
+        check::plausible(message, "imu_rate_bias", &self.imu_rate_bias, LARGEST_COORDINATE)?;
+        check::plausible(message, "full_load_n", &self.full_load_n, LARGEST_EFFORT)?;
+        check::plausible(message, "unloaded_stiffness", &self.unloaded_stiffness[..n], LARGEST_EFFORT)?;
+        check::plausible(message, "unloaded_damping", &self.unloaded_damping[..n], LARGEST_EFFORT)?;
+
         let report = &self.report;
+        let estimate = &self.estimate;
+        for (field, values) in [
+            ("estimate.base_angular_velocity_b", &estimate.base_angular_velocity_b),
+            ("estimate.base_linear_velocity_b", &estimate.base_linear_velocity_b),
+            ("estimate.gyro_bias", &estimate.gyro_bias),
+            ("estimate.accelerometer_bias", &estimate.accelerometer_bias),
+        ] {
+            check::plausible(message, field, values, LARGEST_COORDINATE)?;
+        }
+        check::plausible(message, "estimate.base_orientation_w", &estimate.base_orientation_w, 2.0)?;
         check::plausible(message, "report.worst_violation", &[report.worst_violation], f64::MAX)?;
         let kind: Option<ConstraintKind> = report.worst_constraint();
         check::known(message, "report.worst_constraint", report.worst_constraint, kind)?;
@@ -245,44 +324,6 @@ impl Command {
     /// Whether the command may be applied at a time of the plant's clock.
     pub fn is_valid_at(&self, plant_time_ns: u64) -> bool {
         (self.valid_from_ns..self.valid_until_ns).contains(&plant_time_ns)
-    }
-
-    /// The torque of the feedback law at a measured state: `u = torque + gain [q - q_ref(t); q_dot - q_dot_ref(t)]` within its bounds,
-    /// `time_ns` by the plant's clock. Before its time the reference is where it began; from its end on it stands where it ended.
-    ///
-    /// Cost: O(n²), no allocation. Call it on a validated command.
-    ///
-    /// # Errors
-    /// [`MessageError::WrongLength`] when a slice has another length than `n_joints`; `torque` is untouched then.
-    pub fn torque_into(
-        &self,
-        time_ns: u64,
-        position: &[f64],
-        velocity: &[f64],
-        torque: &mut [f64],
-    ) -> Result<(), MessageError> {
-        let n = check::joint_count(Self::NAME, self.n_joints, self.n_joints as usize)?;
-        for (argument, found) in
-            [("position", position.len()), ("velocity", velocity.len()), ("torque", torque.len())]
-        {
-            if found != n {
-                return Err(MessageError::WrongLength { message: Self::NAME, argument, found, expected: n });
-            }
-        }
-        let (segment, elapsed_s) = self.segment_at(time_ns);
-        let moves = if time_ns < self.valid_until_ns { 1.0 } else { 0.0 };
-        for (i, torque) in torque.iter_mut().enumerate() {
-            let (position_gain, velocity_gain) = self.gain[i].split_at(MAX_JOINTS);
-            *torque = segment.torque[i];
-            for j in 0..n {
-                let (speed, acceleration) = (segment.velocity_ref[j], segment.acceleration_ref[j]);
-                let way = elapsed_s * (speed + 0.5 * elapsed_s * acceleration);
-                *torque += position_gain[j] * (position[j] - segment.position_ref[j] - way);
-                *torque += velocity_gain[j] * (velocity[j] - moves * (speed + elapsed_s * acceleration));
-            }
-            *torque = torque.max(segment.torque_lower[i]).min(segment.torque_upper[i]);
-        }
-        Ok(())
     }
 
     /// The segment in force at a time of the plant's clock, and how long it has been (s). Before and after the command's time those

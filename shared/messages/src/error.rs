@@ -160,6 +160,16 @@ pub enum MessageError {
         /// The upper bound.
         upper: f64,
     },
+    /// More feet than fit, or a joint on the load of a foot that does not exist.
+    #[error("{message}: foot {found}, but there is room for {capacity}; look at the sender")]
+    TooManyFeet {
+        /// The refused message.
+        message: &'static str,
+        /// Feet in the message, or the foot asked for.
+        found: usize,
+        /// Feet that fit.
+        capacity: usize,
+    },
     /// A slice handed in by the caller has another length than the message has joints.
     #[error(
         "{message}: argument {argument} has length {found}, expected {expected}, the joints of this message"
@@ -193,6 +203,7 @@ impl MessageError {
             Self::EmptyBounds { .. } => 11,
             Self::WrongSegmentCount { .. } => 12,
             Self::SegmentOutOfOrder { .. } => 13,
+            Self::TooManyFeet { .. } => 14,
         }
     }
 }

@@ -20,7 +20,7 @@
 //! The crate is `no_std`, needs no allocator and never panics. Feature `shared_memory` adds the marker trait of the shared-memory
 //! transport; only `delmpc-transport` switches it on.
 //!
-//! Reading order: `header`, `joint_set`, `plant_state`, `command`, `cycle_report`, `heartbeat`, `error`.
+//! Reading order: `header`, `joint_set`, `plant_state`, `command`, `servo_law`, `cycle_report`, `heartbeat`, `error`.
 
 #![no_std]
 
@@ -32,14 +32,16 @@ mod header;
 mod heartbeat;
 mod joint_set;
 mod plant_state;
+mod servo_law;
 
-pub use command::{Command, FallbackLevel, MAX_SEGMENTS, Segment, Verdict};
+pub use command::{Command, FallbackLevel, MAX_SEGMENTS, Segment, StateEstimate, Verdict};
 pub use cycle_report::{ConstraintKind, CycleReport};
 pub use error::MessageError;
 pub use header::{Header, Message};
 pub use heartbeat::{Heartbeat, ProcessState, Role};
 pub use joint_set::{JointSetHasher, joint_set_hash};
-pub use plant_state::{ClockKind, PlantState, status};
+pub use plant_state::{ClockKind, FootReading, MAX_FEET, PlantState, foot, sensor, status};
+pub use servo_law::{MAX_RATE_SAMPLES, RateMean, ServoReadings};
 
 /// Joints a message has room for. A larger robot needs a new version of [`PlantState`] and [`Command`].
 pub const MAX_JOINTS: usize = 32;

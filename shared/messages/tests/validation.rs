@@ -3,16 +3,22 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // helpers of tests, too
 
 use delmpc_messages::{
-    ClockKind, Command, ConstraintKind, FallbackLevel, Heartbeat, MAX_JOINTS, Message, MessageError,
-    PlantState, ProcessState, Role, Segment, Verdict, joint_set_hash, status,
+    ClockKind, Command, ConstraintKind, FallbackLevel, FootReading, Heartbeat, MAX_FEET, MAX_JOINTS, Message,
+    MessageError, PlantState, ProcessState, RateMean, Role, Segment, ServoReadings, Verdict, foot,
+    joint_set_hash, sensor, status,
 };
 
 const N: usize = 3;
 const HASH: u64 = joint_set_hash(&["hip", "knee", "ankle"]);
 const RUN: u64 = 7;
 
+/// With all the sensors there can be, and one foot.
 fn state() -> PlantState {
-    PlantState::new(RUN, HASH, N as u32)
+    let mut state = PlantState::new(RUN, HASH, N as u32);
+    state.sensors = sensor::INERTIAL_UNIT | sensor::INERTIAL_SUMS | sensor::MOTION_CAPTURE;
+    state.n_feet = 1;
+    state.feet[0].flags = foot::WRENCH;
+    state
 }
 
 fn command() -> Command {
@@ -68,11 +74,11 @@ fn another_message_type_is_refused() {
 
 #[test]
 fn another_version_is_refused() {
-    let error = state_error(|s| s.header.version = 2);
-    assert_eq!(error, MessageError::WrongVersion { message: PlantState::NAME, found: 2, expected: 1 });
+    let error = state_error(|s| s.header.version = 1);
+    assert_eq!(error, MessageError::WrongVersion { message: PlantState::NAME, found: 1, expected: 2 });
     assert_eq!(
         error.to_string(),
-        "delmpc/PlantState/v1: version 2, expected 1: build both processes from the same source"
+        "delmpc/PlantState/v2: version 1, expected 2: build both processes from the same source"
     );
     assert!(matches!(command_error(|c| c.header.version = 9), MessageError::WrongVersion { found: 9, .. }));
 }
@@ -104,11 +110,12 @@ fn another_joint_count_is_refused_also_beyond_the_capacity() {
 }
 
 type StateField = (&'static str, usize, fn(&mut PlantState) -> &mut [f64]);
+type CommandField = (&'static str, usize, fn(&mut Command) -> &mut f64);
 type SegmentField = (&'static str, fn(&mut Segment) -> &mut [f64]);
 
 #[test]
 fn every_number_of_a_state_is_checked_by_name_and_index() {
-    let fields: [StateField; 9] = [
+    let fields: [StateField; 13] = [
         ("position", N, |s| &mut s.position),
         ("velocity", N, |s| &mut s.velocity),
         ("applied_torque", N, |s| &mut s.applied_torque),
@@ -116,8 +123,12 @@ fn every_number_of_a_state_is_checked_by_name_and_index() {
         ("base_orientation_w", 4, |s| &mut s.base_orientation_w),
         ("base_angular_velocity_b", 3, |s| &mut s.base_angular_velocity_b),
         ("base_linear_velocity_b", 3, |s| &mut s.base_linear_velocity_b),
-        ("stance_torque_b", 3, |s| &mut s.stance_torque_b),
-        ("stance_force_b", 3, |s| &mut s.stance_force_b),
+        ("imu_angle", 3, |s| &mut s.imu_angle),
+        ("imu_velocity", 3, |s| &mut s.imu_velocity),
+        ("imu_angular_velocity", 3, |s| &mut s.imu_angular_velocity),
+        ("imu_specific_force", 3, |s| &mut s.imu_specific_force),
+        ("feet.torque_s", 3, |s| &mut s.feet[0].torque_s),
+        ("feet.force_s", 3, |s| &mut s.feet[0].force_s),
     ];
     for (name, length, field) in fields {
         for index in 0..length {
@@ -154,6 +165,22 @@ fn every_number_of_a_command_is_checked_by_name_and_index() {
             assert_eq!(place(error), ("gain", row * 2 * MAX_JOINTS + column, kind));
         }
     }
+    let fields: [CommandField; 8] = [
+        ("imu_gain", 7, |c| &mut c.imu_gain[1][1]),
+        ("imu_rate_bias", 2, |c| &mut c.imu_rate_bias[2]),
+        ("full_load_n", 1, |c| &mut c.full_load_n[1]),
+        ("unloaded_stiffness", 2, |c| &mut c.unloaded_stiffness[2]),
+        ("unloaded_damping", 0, |c| &mut c.unloaded_damping[0]),
+        ("imu_angle_ref", 2, |c| &mut c.segments[0].imu_angle_ref[2]),
+        ("imu_rate_ref", 0, |c| &mut c.segments[0].imu_rate_ref[0]),
+        ("estimate.gyro_bias", 1, |c| &mut c.estimate.gyro_bias[1]),
+    ];
+    for (name, index, field) in fields {
+        for (value, kind) in BAD {
+            let error = command_error(|c| *field(c) = value);
+            assert_eq!(place(error), (name, index, kind));
+        }
+    }
     let error = command_error(|c| c.report.worst_violation = f64::NAN);
     assert_eq!(place(error), ("report.worst_violation", 0, "NaN"));
 }
@@ -162,6 +189,14 @@ fn every_number_of_a_command_is_checked_by_name_and_index() {
 fn unused_entries_are_not_looked_at() {
     let mut state = state();
     state.position[N] = f64::NAN;
+    state.feet[1].force_s[0] = f64::NAN;
+    assert_eq!(state.validate(HASH, N), Ok(()));
+    // Nor are sensors that are not there.
+    (state.sensors, state.feet[0].flags) = (0, foot::TOUCHES);
+    state.imu_angle[0] = f64::NAN;
+    state.imu_specific_force[1] = f64::NAN;
+    state.feet[0].torque_s[2] = f64::NAN;
+    state.base_orientation_w = [f64::NAN; 4];
     assert_eq!(state.validate(HASH, N), Ok(()));
 
     let mut command = command();
@@ -254,22 +289,28 @@ fn the_feedback_law_is_feed_forward_plus_gain_times_error() {
     command.gain[0][1] = 10.0;
     command.gain[2][MAX_JOINTS] = -4.0;
     let mut torque = [0.0; N];
-    command.torque_into(0, &[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0], &mut torque).unwrap();
+    command.torque_into(0, &ServoReadings::joints(&[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0]), &mut torque).unwrap();
     assert_eq!(torque, [1.0 + 10.0 * (0.7 - 0.2), 2.0, 3.0 - 4.0 * 2.0]);
 
     // Half a second on the reference has moved, and at the end of its time it stops.
     (command.valid_from_ns, command.valid_until_ns) = (1_000_000_000, 3_000_000_000);
     command.segments[0].velocity_ref[1] = 2.0;
     command.segments[0].acceleration_ref[..N].copy_from_slice(&[4.0, 8.0, 0.0]);
-    command.torque_into(1_500_000_000, &[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0], &mut torque).unwrap();
+    command
+        .torque_into(1_500_000_000, &ServoReadings::joints(&[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0]), &mut torque)
+        .unwrap();
     let moved = 0.5 * 2.0 + 0.125 * 8.0;
     assert_eq!(torque, [1.0 + 10.0 * (0.7 - 0.2 - moved), 2.0, 3.0 - 4.0 * (1.0 - (-1.0) - 0.5 * 4.0)]);
     let mut late = [0.0; N];
-    command.torque_into(3_000_000_000, &[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0], &mut torque).unwrap();
-    command.torque_into(9_000_000_000, &[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0], &mut late).unwrap();
+    command
+        .torque_into(3_000_000_000, &ServoReadings::joints(&[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0]), &mut torque)
+        .unwrap();
+    command
+        .torque_into(9_000_000_000, &ServoReadings::joints(&[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0]), &mut late)
+        .unwrap();
     assert_eq!(torque, late);
     command.segments[0].torque_upper[0] = -3.0;
-    command.torque_into(0, &[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0], &mut torque).unwrap();
+    command.torque_into(0, &ServoReadings::joints(&[0.1, 0.7, 0.3], &[1.0, 0.0, 1.0]), &mut torque).unwrap();
     assert_eq!(torque[0], -3.0);
 }
 
@@ -287,7 +328,7 @@ fn a_later_segment_takes_over_at_its_time_and_the_last_one_holds_to_the_end() {
     command.gain[0][0] = 1.0;
     let at = |time_ns| {
         let mut torque = [0.0; N];
-        command.torque_into(time_ns, &[0.0; N], &[0.0; N], &mut torque).unwrap();
+        command.torque_into(time_ns, &ServoReadings::joints(&[0.0; N], &[0.0; N]), &mut torque).unwrap();
         torque[0]
     };
     // Feed-forward of the segment, less where its reference has gone since it began.
@@ -303,9 +344,88 @@ fn a_later_segment_takes_over_at_its_time_and_the_last_one_holds_to_the_end() {
     command.gain[0][MAX_JOINTS] = 1.0;
     let mut torque = [0.0; N];
     for (time_ns, expected) in [(8_999, 2.0 - 1e9), (9_000, 2.0)] {
-        command.torque_into(time_ns, &[0.0; N], &[0.0; N], &mut torque).unwrap();
+        command.torque_into(time_ns, &ServoReadings::joints(&[0.0; N], &[0.0; N]), &mut torque).unwrap();
         assert_eq!(torque[0], expected);
     }
+}
+
+#[test]
+fn feet_are_counted() {
+    let error = state_error(|s| s.n_feet = 1 + MAX_FEET as u32);
+    assert_eq!(error, MessageError::TooManyFeet { message: PlantState::NAME, found: 9, capacity: MAX_FEET });
+    let error = command_error(|c| c.load_foot[1] = 9);
+    assert_eq!(error, MessageError::TooManyFeet { message: Command::NAME, found: 9, capacity: MAX_FEET });
+    for samples in [0, 9] {
+        let error = command_error(|c| c.rate_samples = samples);
+        assert!(matches!(error, MessageError::UnknownCode { field: "rate_samples", .. }), "{error}");
+    }
+}
+
+#[test]
+fn the_law_feels_the_inertial_unit_and_its_bias_goes_on_beyond_the_command() {
+    let mut command = command();
+    (command.valid_from_ns, command.valid_until_ns) = (1_000_000_000, 2_000_000_000);
+    let segment = &mut command.segments[0];
+    (segment.imu_angle_ref[0], segment.imu_rate_ref[0], segment.imu_acceleration_ref[0]) = (0.3, 2.0, 4.0);
+    command.imu_rate_bias[0] = 0.5;
+    command.imu_gain[1] = [10.0, 0.0, 0.0, 100.0, 0.0, 0.0];
+    let at = |time_ns, imu| {
+        let mut torque = [0.0; N];
+        let readings = ServoReadings { imu, ..ServoReadings::joints(&[0.0; N], &[0.0; N]) };
+        command.torque_into(time_ns, &readings, &mut torque).unwrap();
+        assert_eq!((torque[0], torque[2]), (0.0, 0.0));
+        torque[1]
+    };
+    let imu = Some(([1.0, 7.0, 7.0], [3.0, 7.0, 7.0]));
+    assert_eq!(at(1_500_000_000, None), 0.0, "without the unit its term is left out");
+    let angle = 1.0 - 0.3 - (0.5 * 2.0 + 0.125 * 4.0) - 0.5 * 0.5;
+    let rate = 3.0 - (2.0 + 0.5 * 4.0) - 0.5;
+    assert!((at(1_500_000_000, imu) - (10.0 * angle + 100.0 * rate)).abs() < 1e-12);
+    // Half a second after the end: the reference stands where it ended, the sum of the bias does not.
+    let angle = 1.0 - 0.3 - (2.0 + 0.5 * 4.0) - 0.5 * 1.5;
+    assert!((at(2_500_000_000, imu) - (10.0 * angle + 100.0 * (3.0 - 0.5))).abs() < 1e-12);
+}
+
+#[test]
+fn what_a_foot_carries_decides_how_much_of_the_law_its_joints_get() {
+    let mut command = command();
+    command.segments[0].torque[..N].fill(8.0);
+    command.segments[0].position_ref[..N].fill(0.1);
+    (command.load_foot[1], command.full_load_n[1]) = (2, 200.0);
+    (command.unloaded_stiffness[1], command.unloaded_damping[1]) = (5.0, 2.0);
+    let mut feet =
+        [FootReading { flags: foot::WRENCH, reserved: 0, torque_s: [0.0; 3], force_s: [0.0; 3] }; 2];
+    let mut at = |load: f64, flags| {
+        (feet[1].force_s[2], feet[1].flags) = (load, flags);
+        let mut torque = [0.0; N];
+        let readings = ServoReadings { feet: &feet, ..ServoReadings::joints(&[0.3; N], &[1.0; N]) };
+        command.torque_into(0, &readings, &mut torque).unwrap();
+        assert_eq!((torque[0], torque[2]), (8.0, 8.0));
+        torque[1]
+    };
+    let held = -5.0 * (0.3 - 0.1) - 2.0;
+    assert!((at(0.0, foot::WRENCH) - held).abs() < 1e-12);
+    assert!((at(50.0, foot::WRENCH) - (0.25 * 8.0 + 0.75 * held)).abs() < 1e-12);
+    assert_eq!((at(900.0, foot::WRENCH), at(0.0, foot::TOUCHES)), (8.0, 8.0));
+    assert!((at(-30.0, foot::WRENCH) - held).abs() < 1e-12);
+}
+
+#[test]
+fn rates_are_means_over_the_samples_asked_for() {
+    let mut mean = RateMean::default();
+    let mut take = |value: f64, samples| {
+        let (velocity, rate) = mean.take(&[value, -value], &[0.0, 0.0, 2.0 * value], samples);
+        assert_eq!((velocity[1], rate[2]), (-velocity[0], 2.0 * velocity[0]));
+        velocity[0]
+    };
+    assert_eq!(
+        [take(1.0, 4), take(3.0, 4), take(5.0, 1), take(7.0, 4), take(9.0, 4)],
+        [1.0, 2.0, 5.0, 4.0, 6.0]
+    );
+    for k in 0..20 {
+        take(f64::from(k), 8);
+    }
+    assert_eq!(take(20.0, 8), 16.5);
 }
 
 #[test]
@@ -315,7 +435,7 @@ fn segments_are_counted_and_in_order() {
     let error = command_error(|c| c.n_segments = 9);
     assert_eq!(
         error.to_string(),
-        "delmpc/Command/v3: 9 segments, expected 1 to 8; build both processes from the same source"
+        "delmpc/Command/v4: 9 segments, expected 1 to 8; build both processes from the same source"
     );
     let error = command_error(|c| c.segments[0].begin_ns = 1);
     assert!(error.to_string().contains("expected exactly 0 ns"), "{error}");
@@ -329,12 +449,14 @@ fn segments_are_counted_and_in_order() {
 fn the_feedback_law_refuses_slices_of_another_length_and_counts_beyond_the_capacity() {
     let mut command = command();
     let mut torque = [5.0; N];
-    let error = command.torque_into(0, &[0.0; 2], &[0.0; N], &mut torque).unwrap_err();
+    let error =
+        command.torque_into(0, &ServoReadings::joints(&[0.0; 2], &[0.0; N]), &mut torque).unwrap_err();
     assert!(matches!(error, MessageError::WrongLength { argument: "position", found: 2, expected: 3, .. }));
     assert_eq!(torque, [5.0; N], "a refused call changes nothing");
 
     command.n_joints = 1_000;
-    assert!(command.torque_into(0, &[0.0; 1_000], &[0.0; 1_000], &mut [0.0; 1_000]).is_err());
+    let readings = ServoReadings::joints(&[0.0; 1_000], &[0.0; 1_000]);
+    assert!(command.torque_into(0, &readings, &mut [0.0; 1_000]).is_err());
 }
 
 #[test]

@@ -14,7 +14,10 @@ use crate::{Place, Scenario, ScenarioError};
 const LARGEST_FILE: u64 = 1 << 20;
 
 /// Keys that hold one table or a list of tables.
-const LISTS: [&str; 2] = ["push", "fault"];
+const LISTS: [&str; 4] = ["push", "fault", "terrain.box", "terrain.gap"];
+
+/// In the catalogue, the name that stands for all names.
+pub(crate) const ANY_NAME: &str = "*";
 
 /// A scenario file, with overrides, and where each key came from.
 #[derive(Debug, Clone)]
@@ -151,7 +154,8 @@ impl Document {
                 let mut typed = Table::new();
                 for (name, value) in table {
                     let inner = join(key, &name);
-                    let Some(pattern) = known.get(&name) else {
+                    // One pattern for keys of any name.
+                    let Some(pattern) = known.get(&name).or_else(|| known.get(ANY_NAME)) else {
                         return Err(self.unknown(key, &inner, &name, known));
                     };
                     typed.insert(name, self.typed(&inner, value, pattern)?);

@@ -36,7 +36,7 @@ pub use document::Document;
 pub use error::{Place, ScenarioError};
 pub use fault::{FaultKind, FaultSettings, FaultTarget};
 pub use scenario::{
-    Clock, ConstraintSettings, ControllerKind, ControllerSettings, PlantSettings, ProcessSettings,
-    PushSettings, ReachSettings, RobotSettings, Scenario, SensorSettings, SuccessSettings, TimingSettings,
-    WeightSettings,
+    BoxSettings, Clock, ConstraintSettings, ControllerKind, ControllerSettings, GapSettings, PlantSettings,
+    ProcessSettings, PushSettings, ReachSettings, RobotSettings, Scenario, SensorSettings, StartSettings,
+    SuccessSettings, TerrainSettings, TimingSettings, WeightSettings,
 };

@@ -24,6 +24,7 @@ pub(crate) fn check(scenario: &Scenario) -> Result<(), Violation> {
     positive("duration_s", *duration_s, 3600.0)?;
     named("robot.urdf", &robot.urdf, "a URDF file, for example configs/robots/atlas.urdf")?;
 
+    check_ground(scenario)?;
     within("plant.step_s", plant.step_s, 1e-5, 1e-3)?;
     within("plant.friction", plant.friction, 0.0, 10.0)?;
     within("plant.mass_scale", plant.mass_scale, 0.1, 10.0)?;
@@ -43,11 +44,25 @@ pub(crate) fn check(scenario: &Scenario) -> Result<(), Violation> {
         ("sensors.base_position_noise_m", sensors.base_position_noise_m),
         ("sensors.base_orientation_noise_rad", sensors.base_orientation_noise_rad),
         ("sensors.base_velocity_noise_m_s", sensors.base_velocity_noise_m_s),
+        ("sensors.base_angular_velocity_noise_rad_s", sensors.base_angular_velocity_noise_rad_s),
         ("sensors.gyro_noise_rad_s", sensors.gyro_noise_rad_s),
         ("sensors.gyro_bias_rad_s", sensors.gyro_bias_rad_s),
+        ("sensors.gyro_bias_walk_rad_s", sensors.gyro_bias_walk_rad_s),
+        ("sensors.gyro_resolution_rad_s", sensors.gyro_resolution_rad_s),
     ] {
         within(key, value, 0.0, 1.0)?;
     }
+    for (key, value) in [
+        ("sensors.accelerometer_noise_m_s2", sensors.accelerometer_noise_m_s2),
+        ("sensors.accelerometer_bias_m_s2", sensors.accelerometer_bias_m_s2),
+        ("sensors.accelerometer_bias_walk_m_s2", sensors.accelerometer_bias_walk_m_s2),
+        ("sensors.accelerometer_resolution_m_s2", sensors.accelerometer_resolution_m_s2),
+    ] {
+        within(key, value, 0.0, 10.0)?;
+    }
+    each("sensors.imu_position_m", &sensors.imu_position_m, 10.0)?;
+    each("sensors.imu_rpy_rad", &sensors.imu_rpy_rad, 7.0)?;
+    each("sensors.imu_misalignment_rad", &sensors.imu_misalignment_rad, 0.5)?;
     within("sensors.foot_force_noise_n", sensors.foot_force_noise_n, 0.0, 1e4)?;
     within("sensors.foot_torque_noise_nm", sensors.foot_torque_noise_nm, 0.0, 1e4)?;
 
@@ -118,6 +133,52 @@ pub(crate) fn check(scenario: &Scenario) -> Result<(), Violation> {
     }
     within("success.min_cop_margin_m", success.min_cop_margin_m, -10.0, 10.0)?;
     check_timing(&scenario.timing)
+}
+
+/// The ground, and how the robot begins on it.
+fn check_ground(scenario: &Scenario) -> Result<(), Violation> {
+    let Scenario { robot, plant, terrain, .. } = scenario;
+    let start = &robot.start;
+    within("robot.start.height_m", start.height_m, -0.1, 10.0)?;
+    for (key, value) in [
+        ("robot.start.roll_rad", start.roll_rad),
+        ("robot.start.pitch_rad", start.pitch_rad),
+        ("robot.start.yaw_rad", start.yaw_rad),
+    ] {
+        within(key, value, -7.0, 7.0)?;
+    }
+    each("robot.start.position_m", &start.position_m, 1000.0)?;
+    for (joint, offset) in &start.joint_offset {
+        within(&format!("robot.start.joint_offset.{joint}"), *offset, -7.0, 7.0)?;
+    }
+    each("plant.slope_rad", &plant.slope_rad, 0.7)?;
+    within("plant.ground_sink_m", plant.ground_sink_m, 0.0, 0.1)?;
+    within("plant.ground_damping_ratio", plant.ground_damping_ratio, 0.0, 100.0)?;
+    let key = |list: &str, index: usize, count: usize, name: &str| match count {
+        1 => format!("terrain.{list}.{name}"),
+        _ => format!("terrain.{list}[{index}].{name}"),
+    };
+    for (index, block) in terrain.boxes.iter().enumerate() {
+        let key = |name: &str| key("box", index, terrain.boxes.len(), name);
+        each(&key("center_m"), &block.center_m, 1000.0)?;
+        for half in block.half_size_m {
+            positive(&key("half_size_m"), half, 1000.0)?;
+        }
+        within(&key("yaw_rad"), block.yaw_rad, -7.0, 7.0)?;
+    }
+    for (index, gap) in terrain.gaps.iter().enumerate() {
+        let key = |name: &str| key("gap", index, terrain.gaps.len(), name);
+        each(&key("min_m"), &gap.min_m, 1000.0)?;
+        for (axis, (min, max)) in gap.min_m.iter().zip(&gap.max_m).enumerate() {
+            let name = ["x", "y"][axis];
+            if min >= max {
+                let rule = format!("the gap is empty along {name}: `min_m` is {min}");
+                return Err(violation(&key("max_m"), max.to_string(), &rule, "give a larger one"));
+            }
+        }
+        each(&key("max_m"), &gap.max_m, 1000.0)?;
+    }
+    Ok(())
 }
 
 fn check_fault(fault: &FaultSettings, index: usize, faults: usize) -> Result<(), Violation> {

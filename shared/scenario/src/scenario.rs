@@ -1,5 +1,7 @@
 //! The keys of a scenario. Field names are the key names.
 
+use std::collections::BTreeMap;
+
 use serde::{Deserialize, Serialize};
 
 use crate::FaultSettings;
@@ -20,6 +22,9 @@ pub struct Scenario {
     pub robot: RobotSettings,
     /// The simulation.
     pub plant: PlantSettings,
+    /// What lies on the ground or is missing in it.
+    #[serde(skip_serializing_if = "TerrainSettings::is_empty")]
+    pub terrain: TerrainSettings,
     /// The sensors.
     pub sensors: SensorSettings,
     /// The controller.
@@ -52,7 +57,7 @@ pub enum Clock {
 }
 
 /// The robot and how it stands at the beginning.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RobotSettings {
     /// URDF file, relative to the scenario file; its companion table lies beside it.
@@ -61,6 +66,69 @@ pub struct RobotSettings {
     pub stance: String,
     /// Posture it begins and rests in, by its name in the companion table.
     pub posture: String,
+    /// How it begins beside that posture.
+    pub start: StartSettings,
+}
+
+/// How the start differs from the posture on its ground: the whole robot moved, and turned about the origin of its stance sole. A robot
+/// that starts like that has half a second to land before tilt and pressure point of its foot are judged.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
+#[serde(deny_unknown_fields, default)]
+pub struct StartSettings {
+    /// Above the ground, along its normal, m.
+    pub height_m: f64,
+    /// Turned about the stance sole's x axis, rad.
+    pub roll_rad: f64,
+    /// Then about its y axis, rad.
+    pub pitch_rad: f64,
+    /// Then about the ground's normal, rad.
+    pub yaw_rad: f64,
+    /// Moved along the ground, m.
+    pub position_m: [f64; 2],
+    /// Joints that begin elsewhere, by name, rad or m beside the posture.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub joint_offset: BTreeMap<String, f64>,
+}
+
+/// Boxes on the ground and gaps in it, in the axes of the ground: x, y along it, z up from it, its origin where the world's is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
+#[serde(deny_unknown_fields, default)]
+pub struct TerrainSettings {
+    /// Boxes: a list `[[terrain.box]]`.
+    #[serde(rename = "box", with = "crate::list", skip_serializing_if = "Vec::is_empty")]
+    pub boxes: Vec<BoxSettings>,
+    /// Gaps: a list `[[terrain.gap]]`.
+    #[serde(rename = "gap", with = "crate::list", skip_serializing_if = "Vec::is_empty")]
+    pub gaps: Vec<GapSettings>,
+}
+
+impl TerrainSettings {
+    /// Whether the ground is plain.
+    pub fn is_empty(&self) -> bool {
+        self.boxes.is_empty() && self.gaps.is_empty()
+    }
+}
+
+/// A box on the ground.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BoxSettings {
+    /// Its centre, m.
+    pub center_m: [f64; 3],
+    /// Half of its length, width and height, m.
+    pub half_size_m: [f64; 3],
+    /// How it is turned about the ground's normal, rad.
+    pub yaw_rad: f64,
+}
+
+/// A rectangle without ground.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GapSettings {
+    /// Smallest x and y, m.
+    pub min_m: [f64; 2],
+    /// Largest x and y, m.
+    pub max_m: [f64; 2],
 }
 
 /// The simulation.
@@ -81,6 +149,12 @@ pub struct PlantSettings {
     pub actuator_delay_s: f64,
     /// Whether the actuators keep to the torque limits of the URDF.
     pub torque_limits: bool,
+    /// How the ground is tilted about the world's x and y axes, rad. The robot starts on it with its posture turned along.
+    pub slope_rad: [f64; 2],
+    /// How far the ground sinks under the robot's weight on its stance foot at rest, m; 0: rigid.
+    pub ground_sink_m: f64,
+    /// Damping of ground that sinks, relative to the critical one of the robot's mass on it.
+    pub ground_damping_ratio: f64,
 }
 
 /// The sensors. Their noise is given at `noise_scale = 1`.
@@ -101,16 +175,44 @@ pub struct SensorSettings {
     pub velocity_noise_rad_s: f64,
     /// Smallest step of joint velocities (rad/s or m/s).
     pub velocity_resolution_rad_s: f64,
-    /// Noise of the base position (m).
+    /// Whether there is an inertial unit.
+    pub inertial_unit: bool,
+    /// Link it sits on; the root link when not given.
+    pub imu_link: String,
+    /// Its origin in the link's frame, m.
+    pub imu_position_m: [f64; 3],
+    /// Its axes in the link's frame: roll, pitch, yaw, rad.
+    pub imu_rpy_rad: [f64; 3],
+    /// What nobody knows of: it is further turned by this, roll, pitch, yaw in its own axes, rad.
+    pub imu_misalignment_rad: [f64; 3],
+    /// Noise of the gyroscope (rad/s).
+    pub gyro_noise_rad_s: f64,
+    /// Bias of the gyroscope at the start (rad/s).
+    pub gyro_bias_rad_s: f64,
+    /// Walk of that bias in a second (rad/s).
+    pub gyro_bias_walk_rad_s: f64,
+    /// Smallest step of the gyroscope (rad/s).
+    pub gyro_resolution_rad_s: f64,
+    /// Noise of the accelerometer (m/s²).
+    pub accelerometer_noise_m_s2: f64,
+    /// Bias of the accelerometer at the start (m/s²).
+    pub accelerometer_bias_m_s2: f64,
+    /// Walk of that bias in a second (m/s²).
+    pub accelerometer_bias_walk_m_s2: f64,
+    /// Smallest step of the accelerometer (m/s²).
+    pub accelerometer_resolution_m_s2: f64,
+    /// Whether motion capture sees the base: then it is measured, not estimated.
+    pub motion_capture: bool,
+    /// Noise of the base position seen by motion capture (m).
     pub base_position_noise_m: f64,
     /// Noise of the base orientation about each axis (rad).
     pub base_orientation_noise_rad: f64,
     /// Noise of the base's linear velocity (m/s).
     pub base_velocity_noise_m_s: f64,
     /// Noise of the base's angular velocity (rad/s).
-    pub gyro_noise_rad_s: f64,
-    /// Bias of the base's angular velocity (rad/s).
-    pub gyro_bias_rad_s: f64,
+    pub base_angular_velocity_noise_rad_s: f64,
+    /// Whether every foot has a force and torque sensor.
+    pub foot_wrench: bool,
     /// Noise of the foot's force sensor (N).
     pub foot_force_noise_n: f64,
     /// Noise of the foot's torque sensor (N m).
@@ -333,6 +435,7 @@ impl Default for Scenario {
             duration_s: 10.0,
             robot: RobotSettings::default(),
             plant: PlantSettings::default(),
+            terrain: TerrainSettings::default(),
             sensors: SensorSettings::default(),
             controller: ControllerSettings::default(),
             process: ProcessSettings::default(),
@@ -355,12 +458,27 @@ impl Default for PlantSettings {
             com_shift_m: [0.0; 3],
             actuator_delay_s: 0.0,
             torque_limits: true,
+            slope_rad: [0.0; 2],
+            ground_sink_m: 0.0,
+            ground_damping_ratio: 0.3,
         }
     }
 }
 
+impl Default for BoxSettings {
+    fn default() -> Self {
+        Self { center_m: [0.0; 3], half_size_m: [0.1; 3], yaw_rad: 0.0 }
+    }
+}
+
+impl Default for GapSettings {
+    fn default() -> Self {
+        Self { min_m: [0.0; 2], max_m: [0.1; 2] }
+    }
+}
+
 impl Default for SensorSettings {
-    /// Good encoders, a tactical inertial unit with leg odometry, strain gauges under the foot.
+    /// Good encoders, a tactical inertial unit on the root link, strain gauges under the feet.
     fn default() -> Self {
         Self {
             noise_scale: 1.0,
@@ -370,11 +488,25 @@ impl Default for SensorSettings {
             position_resolution_rad: 1e-5,
             velocity_noise_rad_s: 2e-3,
             velocity_resolution_rad_s: 0.0,
+            inertial_unit: true,
+            imu_link: String::new(),
+            imu_position_m: [0.0; 3],
+            imu_rpy_rad: [0.0; 3],
+            imu_misalignment_rad: [0.0; 3],
+            gyro_noise_rad_s: 2e-3,
+            gyro_bias_rad_s: 1e-3,
+            gyro_bias_walk_rad_s: 1e-5,
+            gyro_resolution_rad_s: 0.0,
+            accelerometer_noise_m_s2: 0.02,
+            accelerometer_bias_m_s2: 0.01,
+            accelerometer_bias_walk_m_s2: 1e-4,
+            accelerometer_resolution_m_s2: 0.0,
+            motion_capture: false,
             base_position_noise_m: 1e-4,
             base_orientation_noise_rad: 1e-4,
             base_velocity_noise_m_s: 2e-3,
-            gyro_noise_rad_s: 2e-3,
-            gyro_bias_rad_s: 0.0,
+            base_angular_velocity_noise_rad_s: 2e-3,
+            foot_wrench: true,
             foot_force_noise_n: 2.0,
             foot_torque_noise_nm: 0.2,
         }
@@ -488,6 +620,17 @@ impl Scenario {
             },
             reach: Some(ReachSettings::default()),
             push: vec![PushSettings::default()],
+            robot: RobotSettings {
+                start: StartSettings {
+                    joint_offset: [(crate::document::ANY_NAME.to_owned(), 0.0)].into(),
+                    ..StartSettings::default()
+                },
+                ..RobotSettings::default()
+            },
+            terrain: TerrainSettings {
+                boxes: vec![BoxSettings::default()],
+                gaps: vec![GapSettings::default()],
+            },
             fault: vec![FaultSettings::default()],
             timing: TimingSettings {
                 max_misses: Some(0),

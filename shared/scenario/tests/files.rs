@@ -80,7 +80,7 @@ fn an_unknown_key_is_refused_with_its_line() {
     let message = refused("seed = 1\n\n[plant]\nfriction = 0.5\nfrictoin = 0.6\n");
     assert_eq!(message, "wrong.toml: line 5: unknown key `plant.frictoin`: did you mean `plant.friction`?");
     let message = refused("[sensors]\ncolour = 1\n");
-    let keys = "sensors.base_orientation_noise_rad, sensors.base_position_noise_m";
+    let keys = "sensors.accelerometer_bias_m_s2, sensors.accelerometer_bias_walk_m_s2";
     assert!(
         message.starts_with(&format!(
             "wrong.toml: line 2: unknown key `sensors.colour`: the keys here are {keys}"

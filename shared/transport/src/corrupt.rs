@@ -24,12 +24,12 @@ impl Corrupt for PlantState {
         let numbers = [
             &mut self.position[..n],
             &mut self.velocity[..n],
-            &mut self.base_position_w,
-            &mut self.base_orientation_w,
-            &mut self.base_angular_velocity_b,
-            &mut self.base_linear_velocity_b,
-            &mut self.stance_torque_b,
-            &mut self.stance_force_b,
+            &mut self.imu_angle,
+            &mut self.imu_velocity,
+            &mut self.imu_angular_velocity,
+            &mut self.imu_specific_force,
+            &mut self.feet[0].torque_s,
+            &mut self.feet[0].force_s,
         ];
         set_one(numbers, choice, value);
     }
@@ -61,6 +61,9 @@ impl Corrupt for Command {
             &mut segment.acceleration_ref[..n],
             &mut position_gain[..n],
             &mut velocity_gain[..n],
+            &mut self.imu_gain[row],
+            &mut segment.imu_angle_ref,
+            &mut segment.imu_rate_ref,
         ];
         set_one(numbers, choice, value);
     }

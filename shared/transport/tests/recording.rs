@@ -125,10 +125,10 @@ fn what_is_no_recording_of_this_message_is_refused() {
     let (_, file) = recorded();
     assert!(replay_error::<Command>(&file).contains("another message"));
     assert!(replay_error::<PlantState>(b"no recording at all, only text").contains("not a recording"));
-    assert!(replay_error::<PlantState>(&file[..10]).contains("delmpc/PlantState/v1"));
+    assert!(replay_error::<PlantState>(&file[..10]).contains("delmpc/PlantState/v2"));
     let mut newer = file;
-    newer[12] = 2;
-    assert!(replay_error::<PlantState>(&newer).contains("another version (2)"));
+    newer[12] = 3;
+    assert!(replay_error::<PlantState>(&newer).contains("another version (3)"));
 }
 
 #[test]

@@ -9,7 +9,8 @@
 //! | zero torque | 0 | 0 | |
 
 use delmpc_mechanics::inverse_dynamics::gravity_force_into;
-use delmpc_messages::{FallbackLevel, LARGEST_EFFORT, PlantState};
+use delmpc_messages::{FallbackLevel, LARGEST_EFFORT, PlantState, StateEstimate};
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 
 use super::{Controller, to_ns};
 use crate::config::ControllerKind;
@@ -46,10 +47,11 @@ impl Controller {
         self.command.state_time_ns = self.last_state_ns.unwrap_or(state.time_ns);
         self.command.valid_from_ns = start_ns;
         self.command.valid_until_ns = start_ns + to_ns(self.config.command_life_s);
+        self.tell_estimate();
         for level in LEVELS.into_iter().filter(|candidate| *candidate >= level) {
             self.form_law(level, self.run_time_s(start_ns));
             self.command.fallback_level = level as u32;
-            write_law(&self.law, &self.model.message_joint, &mut self.command);
+            self.tell_law(start_ns);
             if self.command.validate(self.model.joint_set_hash, n).is_ok() {
                 if level > self.ladder.level() {
                     self.ladder.descend_to(level);
@@ -57,6 +59,49 @@ impl Controller {
                 self.past_laws.push(self.run_time_s(start_ns), &self.law);
                 return;
             }
+        }
+    }
+
+    /// What is believed of base and feet goes along.
+    fn tell_estimate(&mut self) {
+        let out = &mut self.command.estimate;
+        let Some(base) = self.estimator.base() else { return };
+        let rotation = Rotation3::from_matrix_unchecked(base.base_link_pose_w.rotation);
+        *out = StateEstimate {
+            known: 1,
+            feet_loaded: (self.estimator.feet().iter().enumerate())
+                .map(|(k, foot)| u32::from(foot.loaded) << k)
+                .sum(),
+            base_orientation_w: UnitQuaternion::from_rotation_matrix(&rotation).coords.into(),
+            base_angular_velocity_b: base.base_twist_b.angular.into(),
+            base_linear_velocity_b: base.base_twist_b.linear.into(),
+            gyro_bias: base.gyro_bias.into(),
+            accelerometer_bias: base.accelerometer_bias.into(),
+        };
+    }
+
+    /// Writes the law out: in terms of the encoders, and of the gyroscope where the stance foot was levelled.
+    fn tell_law(&mut self, start_ns: u64) {
+        let joints = &self.model.message_joint;
+        write_law(&self.law, joints, &mut self.command);
+        self.command.imu_gain = Default::default();
+        let n = self.model.tree.dof();
+        let Estimate { q, q_dot, ground_lean, .. } = self.estimator.estimate();
+        let levelled = self.estimator.levelled();
+        if let Some((level, Some(angle))) = levelled {
+            let since_s = start_ns.saturating_sub(self.command.state_time_ns) as f64 * 1e-9;
+            self.scratch[..n].copy_from_slice(q);
+            self.scratch[n..].copy_from_slice(q_dot);
+            let mounting = self.model.sensing.as_ref().map(|sensing| sensing.estimator.imu_mounting.rotation);
+            let bias = self.estimator.base().map(|base| base.gyro_bias).unwrap_or_default();
+            let unit = (&mounting.unwrap_or_else(Matrix3::identity), &angle, &bias);
+            level.write(&self.law, joints, unit, (&self.scratch, since_s), &mut self.command);
+        } else if let Some((level, None)) = levelled {
+            level.write_encoders(joints, &mut self.command);
+        }
+        if let Some(leg) = &self.unloaded_leg {
+            let level = levelled.filter(|(_, angle)| angle.is_some()).map(|(level, _)| level);
+            leg.write(level, q, (*ground_lean).into(), joints, &mut self.command);
         }
     }
 
@@ -71,7 +116,11 @@ impl Controller {
         };
         match effective {
             FallbackLevel::FreshSolution | FallbackLevel::ShiftedPlan => self.form_law_of_plan(level, time_s),
-            FallbackLevel::StaticLqr => self.law.copy_from(&self.static_law),
+            FallbackLevel::StaticLqr => {
+                self.law.copy_from(&self.static_law);
+                self.keep_last_bounds(false);
+                self.law.segments_mut().iter_mut().for_each(LawSegment::clamp);
+            }
             FallbackLevel::GravityHold | FallbackLevel::DampingOnly | FallbackLevel::ZeroTorque => {
                 self.form_passive_law(effective);
             }
@@ -116,6 +165,8 @@ impl Controller {
         self.bound_law();
         if level == FallbackLevel::FreshSolution {
             self.keep_pressure_point(first);
+        } else {
+            self.keep_last_bounds(true);
         }
         self.law.segments_mut().iter_mut().for_each(LawSegment::clamp);
     }
@@ -125,11 +176,29 @@ impl Controller {
     fn keep_pressure_point(&mut self, stage: usize) {
         let Some((first, later)) = self.law.segments_mut().split_first_mut() else { return };
         bound_by_pressure_point(&self.horizon, stage, &self.solution, &self.force_change, first);
+        for (kept, now) in self.last_bounds.iter_mut().zip([&first.torque, &first.lower, &first.upper]) {
+            kept.copy_from_slice(now);
+        }
         for segment in later {
             for j in 0..first.torque.len() {
                 let shift = segment.torque[j] - first.torque[j];
                 segment.lower[j] = segment.lower[j].max(first.lower[j] + shift).min(segment.upper[j]);
                 segment.upper[j] = segment.upper[j].min(first.upper[j] + shift).max(segment.lower[j]);
+            }
+        }
+    }
+
+    /// Narrows the bounds of all segments to what the pressure point left in the last fresh plan: a law without room for it must not take
+    /// the place of one with.
+    fn keep_last_bounds(&mut self, moves: bool) {
+        let [torque, lower, upper] = &self.last_bounds;
+        for segment in self.law.segments_mut() {
+            for j in 0..torque.len() {
+                let (least, most) = (segment.lower[j], segment.upper[j]);
+                // A plan that moves on takes its room along; a posture held has the room there was.
+                let shift = if moves { segment.torque[j] - torque[j] } else { 0.0 };
+                segment.lower[j] = (lower[j] + shift.min(0.0)).clamp(least, most);
+                segment.upper[j] = (upper[j] + shift.max(0.0)).clamp(least, most);
             }
         }
     }
@@ -171,6 +240,7 @@ impl Controller {
             }
         }
         self.bound_law();
+        self.keep_last_bounds(false);
         self.law.segments_mut().iter_mut().for_each(LawSegment::clamp);
     }
 }

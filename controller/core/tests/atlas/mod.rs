@@ -2,13 +2,14 @@
 #![allow(dead_code)]
 
 use delmpc_controller_core::prelude::*;
+use delmpc_estimation::prelude::{EstimatorConfig, EstimatorModel, FootModel};
 use delmpc_mechanics::forces::{PointForce, StepForces};
 use delmpc_mechanics::kinematics::{Configuration, Kinematics, Velocity, base_link_pose};
 use delmpc_mechanics::lobatto::LobattoRule;
-use delmpc_mechanics::spatial::RigidTransform;
+use delmpc_mechanics::spatial::{RigidTransform, Twist};
 use delmpc_mechanics::state::State;
 use delmpc_mechanics::step::{Integrator, StepOptions};
-use delmpc_messages::{Command, PlantState, joint_set_hash};
+use delmpc_messages::{Command, PlantState, ServoReadings, joint_set_hash, sensor};
 use delmpc_robots::{RobotModel, RootedModel, load};
 use nalgebra::{UnitQuaternion, Vector3};
 
@@ -35,6 +36,17 @@ impl Atlas {
         BodyPoint { body: attachment.body.unwrap(), position: attachment.pose.translation }
     }
 
+    /// Right and left, as in the messages.
+    pub fn feet(&self) -> Vec<FootModel> {
+        let foot = |sole: &delmpc_robots::Sole| {
+            let frame = self.floating.frame(&sole.frame).unwrap();
+            let polygon = sole.polygon.iter().map(|p| [p.x, p.y]).collect();
+            FootModel { body: frame.body.unwrap(), sole: frame.pose, polygon }
+        };
+        assert_eq!(self.floating.soles[0].name, "right");
+        self.floating.soles.iter().map(foot).collect()
+    }
+
     pub fn controller_model(&self) -> ControllerModel {
         let rooted = &self.rooted.model;
         let sole = self.floating.sole("right").unwrap();
@@ -56,8 +68,13 @@ impl Atlas {
             hand: Some(self.point("l_hand_point")),
             swing_foot: Some(self.point("l_sole_centre")),
             posture: rooted.posture("one_foot_right").unwrap().q.clone(),
-            stance: Some(StanceObservation {
-                floating: self.floating.tree.clone(),
+            sensing: Some(Sensing {
+                estimator: EstimatorModel {
+                    reference_foot: 0,
+                    ..EstimatorModel::new(self.floating.tree.clone(), self.feet())
+                },
+                config: EstimatorConfig::default(),
+                stance_foot: 0,
                 rerooted: self.rooted.rerooted.clone(),
             }),
         }
@@ -122,7 +139,8 @@ impl WeldedPlant {
         }
         let mut message_torque = vec![0.0; n];
         if let Some(command) = &self.command {
-            command.torque_into(self.time_ns, &position, &velocity, &mut message_torque).unwrap();
+            let readings = ServoReadings::joints(&position, &velocity);
+            command.torque_into(self.time_ns, &readings, &mut message_torque).unwrap();
         }
         for (i, &joint) in self.model.message_joint.iter().enumerate() {
             let limit = self.model.limits[i].effort;
@@ -147,9 +165,15 @@ impl WeldedPlant {
             out.velocity[joint] = self.rate[i];
         }
         self.update_kinematics();
-        let stance = self.model.stance.as_ref().unwrap();
-        let base = stance.rerooted.base_pose_w(&self.kinematics, &RigidTransform::identity());
-        let link = base_link_pose(&stance.floating, &base);
+        let sensing = self.model.sensing.as_ref().unwrap();
+        let (rerooted, floating) = (&sensing.rerooted, &sensing.estimator.tree);
+        let base = rerooted.base_pose_w(&self.kinematics, &RigidTransform::identity());
+        let link = base_link_pose(floating, &base);
+        let twist_w = rerooted.base_twist_w(&self.kinematics, &RigidTransform::identity(), &Twist::default());
+        let twist_b = link.inverse_transform_twist(&twist_w);
+        out.sensors = sensor::MOTION_CAPTURE;
+        out.base_angular_velocity_b = twist_b.angular.into();
+        out.base_linear_velocity_b = twist_b.linear.into();
         out.base_position_w = link.translation.into();
         let rotation = nalgebra::Rotation3::from_matrix_unchecked(link.rotation);
         let quaternion = UnitQuaternion::from_rotation_matrix(&rotation);

@@ -197,15 +197,15 @@ fn another_message_type_is_refused_by_name() {
 /// A later version of [`PlantState`] with the same size.
 #[derive(Debug, Clone, Copy, Pod, Zeroable, ZeroCopySend)]
 #[repr(C)]
-#[type_name("delmpc/PlantState/v2")]
-struct PlantStateV2 {
+#[type_name("delmpc/PlantState/v3")]
+struct PlantStateV3 {
     state: PlantState,
 }
 
-impl Message for PlantStateV2 {
-    const NAME: &'static str = "delmpc/PlantState/v2";
+impl Message for PlantStateV3 {
+    const NAME: &'static str = "delmpc/PlantState/v3";
     const MAGIC: u32 = PlantState::MAGIC;
-    const VERSION: u32 = 2;
+    const VERSION: u32 = 3;
 
     fn header(&self) -> &Header {
         &self.state.header
@@ -221,9 +221,9 @@ fn another_version_is_refused_by_name_even_with_the_same_size() {
     let run = TestRun::new();
     let node = RunNode::open(run.0, HASH).unwrap();
     let _states = node.publisher::<PlantState>(Channel::State).unwrap();
-    let result: Result<SharedSubscriber<PlantStateV2>, LinkError> = node.subscriber(Channel::State);
+    let result: Result<SharedSubscriber<PlantStateV3>, LinkError> = node.subscriber(Channel::State);
     let text = result.unwrap_err().to_string();
-    assert!(text.contains("delmpc/PlantState/v1") && text.contains("delmpc/PlantState/v2"), "{text}");
+    assert!(text.contains("delmpc/PlantState/v2") && text.contains("delmpc/PlantState/v3"), "{text}");
 }
 
 #[test]
