@@ -9,7 +9,7 @@ use delmpc_controller_process::controller_loop::Ending;
 use delmpc_controller_process::machine::prepare;
 use delmpc_controller_process::membership::Order;
 use delmpc_controller_process::records::Records;
-use delmpc_messages::{JointSetHasher, Role};
+use delmpc_messages::Role;
 use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::{RunId, remove_leftovers};
 use rustix::process::{Pid, getppid};
@@ -26,10 +26,7 @@ use crate::verdict::{Ended, Failure};
 pub fn run_id(arguments: &PartArguments, setup: &Setup) -> Result<RunId, Failure> {
     match &arguments.run_id {
         Some(text) => text.parse().map_err(|error| Failure::Input(format!("--run-id: {error}"))),
-        None => {
-            let scenario = setup.scenario.to_toml();
-            Ok(RunId(JointSetHasher::new().joint(&scenario).finish()))
-        }
+        None => RunId::of_text(&setup.scenario.to_toml()).map_err(Failure::fault),
     }
 }
 

@@ -16,7 +16,7 @@ use crate::setup::{Setup, scenario_file};
 use crate::status_line::StatusLine;
 use crate::summary::Summary;
 use crate::summary_table::summary_table;
-use crate::supervisor::{Course, Supervision, fresh_run};
+use crate::supervisor::{Course, Supervision, TIDY_UP, fresh_run};
 use crate::verdict::{Ended, Failure};
 use crate::view::View;
 
@@ -108,8 +108,8 @@ fn run_in_two_processes(
     view: &mut Option<View>,
 ) -> Result<Course, Failure> {
     let talkative = !options.quiet && !options.json;
-    remove_dead_runs();
-    let run = fresh_run();
+    remove_dead_runs(TIDY_UP, || stop.is_set());
+    let run = fresh_run()?;
     if options.view {
         let opened = view.insert(View::new(setup, options.port)?);
         let _ = writeln!(std::io::stderr(), "open {} to begin", opened.address());

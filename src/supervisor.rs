@@ -18,7 +18,7 @@ use std::path::PathBuf;
 use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{JoinHandle, sleep};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
 use delmpc_controller_process::clock::monotonic_ns;
 use delmpc_controller_process::presence::{Peer, Presence};
@@ -33,6 +33,8 @@ use crate::verdict::Failure;
 const LOOK: Duration = Duration::from_millis(5);
 /// A process may take this long to load, connect and warm up (s). Far beyond a healthy start on a busy machine.
 const START_PATIENCE_S: f64 = 60.0;
+/// Looking for what earlier runs have left takes no longer than this.
+pub const TIDY_UP: Duration = Duration::from_secs(3);
 /// A process that was asked to end is killed after this (s).
 const END_PATIENCE_S: f64 = 3.0;
 
@@ -74,10 +76,11 @@ pub enum Course {
 }
 
 /// A run nobody else has.
-#[allow(clippy::disallowed_methods, reason = "two runs differ even if the clock jumps: by their supervisors")]
-pub fn fresh_run() -> RunId {
-    let time_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as u64);
-    RunId::from_seeds(time_ns, std::process::id())
+///
+/// # Errors
+/// When the operating system has no random numbers.
+pub fn fresh_run() -> Result<RunId, Failure> {
+    RunId::random().map_err(Failure::fault)
 }
 
 /// The numbers by which the operating system knows the processes, and how far they are.

@@ -39,6 +39,7 @@ use delmpc_transport::remove_dead_runs;
 use serde::Serialize;
 
 use crate::setup::{FAULT_SCENARIO, Setup, scenario_file, scenario_file_or};
+use crate::supervisor::TIDY_UP;
 use crate::timing::criteria::{Criterion, Measured, criteria};
 use crate::timing::machine_facts::MachineFacts;
 use crate::timing::phases::{FloorFigures, LoopFigures, Phases, without_privileges};
@@ -132,7 +133,7 @@ pub fn timing(arguments: &TimingArguments) -> Result<Ended, Failure> {
     std::fs::create_dir_all(&folder)
         .map_err(|error| Failure::Input(format!("--out {}: {error}", folder.display())))?;
     let stop = StopFlag::on_signals().map_err(Failure::fault)?;
-    remove_dead_runs();
+    remove_dead_runs(TIDY_UP, || stop.is_set());
     let Some(report) = all_phases(arguments, &setup, &folder, &stop)? else {
         return Ok(Ended::Interrupted);
     };
@@ -161,7 +162,7 @@ fn faults(arguments: &TimingArguments) -> Result<Ended, Failure> {
     std::fs::create_dir_all(&folder)
         .map_err(|error| Failure::Input(format!("--out {}: {error}", folder.display())))?;
     let stop = StopFlag::on_signals().map_err(Failure::fault)?;
-    remove_dead_runs();
+    remove_dead_runs(TIDY_UP, || stop.is_set());
     if !arguments.json {
         println!("{}", campaign::head());
     }

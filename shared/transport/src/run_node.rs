@@ -20,6 +20,7 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use iceoryx2::service::static_config::messaging_pattern::MessagingPattern as StaticPattern;
 
 use crate::abandoned::without_waiting_for_the_lost;
+use crate::leftovers::clear_the_way;
 use crate::shared_link::MOST_BORROWED;
 use crate::{Channel, LinkError, Payload, RunId, SharedPublisher, SharedSubscriber};
 
@@ -52,10 +53,11 @@ impl RunNode {
     /// Enters a run. A process that loads no robot, like the supervisor, passes 0 for `joint_set_hash` and uses heartbeats only.
     ///
     /// # Errors
-    /// [`LinkError::NoSharedMemory`].
+    /// [`LinkError::NoSharedMemory`], [`LinkError::NotPrivate`], [`LinkError::NoRuntimeFolder`].
     pub fn open(run: RunId, joint_set_hash: u64) -> Result<Self, LinkError> {
         set_log_level(LogLevel::Fatal); // errors come back as values; standard error belongs to the process
         let config = config_of(run)?;
+        clear_the_way(run)?;
         let create = || {
             let node = NodeBuilder::new().config(&config).signal_handling_mode(SignalHandlingMode::Disabled);
             node.create::<ipc::Service>()
@@ -71,7 +73,8 @@ impl RunNode {
             }
             node
         });
-        let node = node.map_err(|source| LinkError::NoSharedMemory { run, root: run.root_path(), source })?;
+        let root = run.root_path()?;
+        let node = node.map_err(|source| LinkError::NoSharedMemory { run, root, source })?;
         Ok(Self { node, run, joint_set_hash })
     }
 
@@ -263,7 +266,7 @@ pub(crate) fn config_of(run: RunId) -> Result<Config, LinkError> {
         channel: "all",
         reason: format!("{} cannot be part of a name in shared memory", what.display()),
     };
-    let (prefix, root) = (run.prefix(), run.root_path());
+    let (prefix, root) = (run.prefix(), run.root_path()?);
     let prefix_name = iceoryx2::prelude::FileName::new(prefix.as_bytes());
     config.global.prefix = prefix_name.map_err(|_| unusable(prefix.as_ref()))?;
     let root_name = iceoryx2::prelude::Path::new(root.as_os_str().as_encoded_bytes());
