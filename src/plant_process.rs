@@ -58,24 +58,44 @@ pub trait Plant {
     fn truth(&mut self, truth: &mut Truth);
 }
 
+/// Periods beyond the scenario's delays that a command may lie ahead: a plan prepared for a later tick, a tick that was missed.
+const MOST_PERIODS_AHEAD: f64 = 10.0;
+
 /// Commands whose time has not come.
 #[derive(Debug)]
 pub struct CommandQueue {
     waiting: VecDeque<Command>,
+    /// A command that begins later than this after it came is of no controller of ours (ns).
+    longest_lead_ns: u64,
 }
 
 impl CommandQueue {
     /// For a scenario.
     pub fn new(scenario: &Scenario) -> Self {
-        Self { waiting: VecDeque::with_capacity(scenario.controller.delay_cycles as usize + 4) }
+        let (controller, sensors) = (&scenario.controller, &scenario.sensors);
+        let periods = f64::from(controller.delay_cycles) + MOST_PERIODS_AHEAD;
+        let lead_s = periods / controller.mpc_rate_hz
+            + sensors.delay_s
+            + scenario.plant.actuator_delay_s
+            + controller.max_state_age_s;
+        Self {
+            waiting: VecDeque::with_capacity(controller.delay_cycles as usize + 4),
+            longest_lead_ns: (lead_s * 1e9).round() as u64,
+        }
     }
 
-    /// Takes a command in; a full queue gives up its oldest one.
-    pub fn push(&mut self, command: &Command) {
+    /// Takes a command in that came at `now_ns`; a full queue gives up its oldest one. `false`: it is of another run, or lies too far
+    /// ahead, and is refused: it would keep out those that come after it.
+    pub fn push(&mut self, command: &Command, run_id: u64, now_ns: u64) -> bool {
+        let ahead_ns = command.valid_from_ns.saturating_sub(now_ns);
+        if command.header.validate_run::<Command>(run_id).is_err() || ahead_ns > self.longest_lead_ns {
+            return false;
+        }
         if self.waiting.len() == self.waiting.capacity() {
             self.waiting.pop_front();
         }
         self.waiting.push_back(*command);
+        true
     }
 
     /// Gives the plant the commands whose time has come; says how many it refused.
@@ -363,22 +383,25 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
         }
     }
 
-    /// Takes the latest command into the queue; says which state it answers.
+    /// Takes the latest command into the queue; says which state it answers. One that is refused answers nothing.
     fn receive(&mut self) -> Result<Option<u64>, PlantFault> {
         let Some(command) = self.commands.receive_latest()? else {
             return Ok(None);
         };
-        self.queue.push(command);
+        self.log.command(self.time_ns, command);
+        if !self.queue.push(command, self.state.header.run_id, self.time_ns) {
+            self.commands_refused += 1;
+            return Ok(None);
+        }
         let realtime = self.scenario.clock == Clock::Realtime;
         if realtime && command.state_sequence > 1 {
-            let measured_ns = self.start_ns + command.state_time_ns;
+            let measured_ns = self.start_ns.saturating_add(command.state_time_ns);
             let age_ns = monotonic_ns().saturating_sub(measured_ns);
             self.arrival = (command.header.sent_at_ns, age_ns);
             if self.timing.ages_ns.len() < self.timing.ages_ns.capacity() {
                 self.timing.ages_ns.push(age_ns);
             }
         }
-        self.log.command(self.time_ns, command);
         Ok(Some(command.state_sequence))
     }
 
@@ -476,5 +499,47 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
             commands_refused: self.commands_refused,
             watchdog_level_max: self.watchdog_level_max,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Takes everything.
+    #[derive(Default)]
+    struct Taken(Vec<u64>);
+
+    impl Plant for Taken {
+        fn accept(&mut self, command: &Command) -> bool {
+            self.0.push(command.header.sequence);
+            true
+        }
+        fn step(&mut self) -> Result<(), String> {
+            Ok(())
+        }
+        fn pull(&mut self, _pull: &Pull) {}
+        fn measure(&mut self, _state: &mut PlantState) {}
+        fn truth(&mut self, _truth: &mut Truth) {}
+    }
+
+    #[test]
+    fn commands_of_another_run_or_of_the_far_future_do_not_enter_the_queue_and_the_next_good_one_acts() {
+        let mut queue = CommandQueue::new(&Scenario::default());
+        let command = |run, sequence, valid_from_ns| {
+            let mut command = Command::new(run, 2, 3);
+            command.header.sequence = sequence;
+            (command.valid_from_ns, command.valid_until_ns) = (valid_from_ns, valid_from_ns);
+            command
+        };
+        let now_ns = 1_000_000_000;
+        assert!(!queue.push(&command(8, 1, now_ns), 7, now_ns));
+        for far_ns in [u64::MAX, now_ns + 5_000_000_000, 1 << 62] {
+            assert!(!queue.push(&command(7, 2, far_ns), 7, now_ns), "{far_ns}");
+        }
+        assert!(queue.push(&command(7, 3, now_ns), 7, now_ns));
+        let mut plant = Taken::default();
+        assert_eq!(queue.hand_over(&mut plant, now_ns), 0);
+        assert_eq!(plant.0, [3]);
     }
 }

@@ -129,7 +129,7 @@ fn compare(setup: &Setup, log: &[u8], file: &Path) -> Result<Result<Compared, St
                     }
                     compared.commands += 1;
                 }
-                queue.push(&logged);
+                queue.push(&logged, state.header.run_id, truth.time_ns);
             }
             _ => {}
         }
