@@ -100,11 +100,11 @@ impl ControllerProcess<'_> {
 /// machine: in lockstep they are left out, so that runs are reproducible.
 pub fn part(scenario: &Scenario, figures: &CycleFigures) -> ControllerPart {
     let realtime = scenario.clock == Clock::Realtime;
-    let [p50, p99, p999, max] = figures.percentiles_s(|cycle| cycle.total_ns, [0.5, 0.99, 0.999, 1.0]);
-    let [feedback_p50, feedback_p99] = figures.percentiles_s(|cycle| cycle.feedback_ns, [0.5, 0.99]);
-    let [linearize] = figures.percentiles_s(|cycle| cycle.linearize_ns, [0.5]);
-    let [riccati] = figures.percentiles_s(|cycle| cycle.riccati_ns, [0.5]);
-    let [qp] = figures.percentiles_s(|cycle| cycle.qp_ns, [0.5]);
+    let durations = figures.durations();
+    let [p50, p99, p999, max] = [0.5, 0.99, 0.999, 1.0].map(|part| durations.total.percentile_s(part));
+    let [feedback_p50, feedback_p99] = [0.5, 0.99].map(|part| durations.feedback.percentile_s(part));
+    let [linearize, riccati, qp] =
+        [&durations.linearize, &durations.riccati, &durations.qp].map(|stage| stage.percentile_s(0.5));
     let timed = |value: Option<f64>| value.filter(|_| realtime);
     let verdicts = |verdict: Verdict| figures.verdicts[verdict as usize];
     ControllerPart {

@@ -18,7 +18,7 @@ use std::time::Duration;
 
 use delmpc_controller_process::clock::{monotonic_ns, sleep_until};
 use delmpc_controller_process::controller_loop::Ending;
-use delmpc_controller_process::figures::percentile;
+use delmpc_controller_process::durations::Durations;
 use delmpc_controller_process::membership::{Attendance, Order};
 use delmpc_controller_process::records::{Records, StepRecord};
 use delmpc_controller_process::usage::Usage;
@@ -164,8 +164,8 @@ pub struct PlantRun {
 /// What the wall clock said.
 #[derive(Debug, Default)]
 struct Timing {
-    steps_ns: Vec<u64>,
-    ages_ns: Vec<u64>,
+    steps: Durations,
+    ages: Durations,
     pauses: u64,
     begin_ns: u64,
     end_ns: u64,
@@ -174,8 +174,6 @@ struct Timing {
 impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
     /// A loop for a scenario. `blank` is a state with run, joint set and joint count filled in.
     pub fn new(scenario: &'a Scenario, states: P, commands: S, blank: &PlantState, log: Log) -> Self {
-        let realtime = scenario.clock == Clock::Realtime;
-        let room = if realtime { scenario.steps() as usize + 1 } else { 0 };
         let step_ns = (scenario.plant.step_s * 1e9).round() as u64;
         Self {
             scenario,
@@ -191,11 +189,7 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
             step_ns,
             time_ns: 0,
             start_ns: 0,
-            timing: Timing {
-                steps_ns: Vec::with_capacity(room),
-                ages_ns: Vec::with_capacity(room),
-                ..Timing::default()
-            },
+            timing: Timing { steps: Durations::new(), ages: Durations::new(), ..Timing::default() },
             commands_refused: 0,
             watchdog_level_max: 0,
             records: Records::none(),
@@ -300,7 +294,7 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
             let begin_ns = monotonic_ns();
             let goes_on = self.step(plant)?;
             let end_ns = monotonic_ns();
-            self.timing.steps_ns.push(end_ns - begin_ns);
+            self.timing.steps.add(end_ns - begin_ns);
             self.timing.end_ns = end_ns;
             if goes_on {
                 self.send_state(plant, 0)?;
@@ -398,9 +392,7 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
             let measured_ns = self.start_ns.saturating_add(command.state_time_ns);
             let age_ns = monotonic_ns().saturating_sub(measured_ns);
             self.arrival = (command.header.sent_at_ns, age_ns);
-            if self.timing.ages_ns.len() < self.timing.ages_ns.capacity() {
-                self.timing.ages_ns.push(age_ns);
-            }
+            self.timing.ages.add(age_ns);
         }
         Ok(Some(command.state_sequence))
     }
@@ -480,19 +472,16 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
         Ok(())
     }
 
-    fn part(&mut self) -> PlantPart {
-        let timing = &mut self.timing;
-        timing.steps_ns.sort_unstable();
-        timing.ages_ns.sort_unstable();
-        let at = |sorted: &[u64], part| percentile(sorted, part).map(|ns| ns as f64 * 1e-9);
+    fn part(&self) -> PlantPart {
+        let timing = &self.timing;
         let realtime = self.scenario.clock == Clock::Realtime;
         let wall_s = timing.end_ns.saturating_sub(timing.begin_ns) as f64 * 1e-9;
         let simulated_s = self.time_ns as f64 * 1e-9;
         PlantPart {
             robot: self.metrics.figures(),
-            state_to_command_age_p50_s: at(&timing.ages_ns, 0.5),
-            state_to_command_age_p999_s: at(&timing.ages_ns, 0.999),
-            plant_step_p50_s: at(&timing.steps_ns, 0.5),
+            state_to_command_age_p50_s: timing.ages.percentile_s(0.5),
+            state_to_command_age_p999_s: timing.ages.percentile_s(0.999),
+            plant_step_p50_s: timing.steps.percentile_s(0.5),
             plant_real_time_factor: (wall_s > 0.0).then(|| simulated_s / wall_s),
             plant_pauses: realtime.then_some(timing.pauses),
             log_records_dropped: 0,

@@ -68,8 +68,6 @@ pub struct ControllerLoop<'a, S, P> {
 impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S, P> {
     /// A loop for a scenario. `blank` is a command with run, joint set and joint count filled in.
     pub fn new(scenario: &'a Scenario, states: S, commands: P, blank: &Command) -> Self {
-        // Half as much again as the run needs: states may be slow to come.
-        let cycles = 1.5 * scenario.duration_s * scenario.controller.mpc_rate_hz;
         Self {
             scenario,
             states,
@@ -78,7 +76,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
             command: Box::new(*blank),
             delay_ns: (scenario.sensors.delay_s * 1e9).round() as u64,
             allocations: None,
-            figures: CycleFigures::with_capacity(cycles as usize + 1000),
+            figures: CycleFigures::new(),
             records: Records::none(),
         }
     }
@@ -86,7 +84,9 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
     /// Keeps a record of every cycle.
     #[must_use]
     pub fn recording(mut self) -> Self {
-        self.records = Records::with_capacity(self.figures.capacity());
+        // Half as much again as the run needs: states may be slow to come.
+        let cycles = 1.5 * self.scenario.duration_s * self.scenario.controller.mpc_rate_hz;
+        self.records = Records::with_capacity(cycles as usize + 1000);
         self
     }
 
@@ -213,7 +213,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
 
     fn first_answer_given(&mut self, membership: &mut impl Attendance) -> Result<(), LinkError> {
         // What the first cycles cost is not what a cycle costs.
-        self.figures = CycleFigures::with_capacity(self.figures.capacity());
+        self.figures = CycleFigures::new();
         self.records.clear();
         membership.announce(ProcessState::Ready)
     }
@@ -267,7 +267,6 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
             linearize_ns: command.report.linearize_ns,
             riccati_ns: command.report.riccati_ns,
             qp_ns: command.report.qp_ns,
-            age_ns: if realtime { sent_ns.saturating_sub(measured_ns) } else { 0 },
         };
         self.figures.add(command, figure);
         command.report.publish_ns = if realtime { sent_ns - computed_ns } else { 0 };
