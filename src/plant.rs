@@ -77,7 +77,7 @@ pub fn log_head(setup: &Setup, run: RunId) -> LogHead {
         0,
         ("scenario.toml".to_owned(), "application/toml", effective_scenario(setup).to_toml().into_bytes()),
     );
-    LogHead { about: about(setup, run), files, viewer: Some(LogViewer::new(setup)) }
+    LogHead { about: about(setup, Some(run)), files, viewer: Some(LogViewer::new(setup)) }
 }
 
 /// The scenario as it is in the run's folder.
@@ -87,7 +87,8 @@ fn effective_scenario(setup: &Setup) -> Scenario {
     scenario
 }
 
-fn about(setup: &Setup, run: RunId) -> BTreeMap<String, String> {
+/// What identifies a run; in real time, if `run` is given, also what is of this one only.
+pub fn about(setup: &Setup, run: Option<RunId>) -> BTreeMap<String, String> {
     let scenario = effective_scenario(setup);
     let mut about = BTreeMap::from([
         ("program".to_owned(), concat!("delmpc ", env!("CARGO_PKG_VERSION")).to_owned()),
@@ -99,7 +100,7 @@ fn about(setup: &Setup, run: RunId) -> BTreeMap<String, String> {
         ("model_hash".to_owned(), format!("{:016x}", setup.model_hash())),
         ("git_revision".to_owned(), env!("DELMPC_GIT_REVISION").to_owned()),
     ]);
-    if scenario.clock == Clock::Realtime {
+    if let Some(run) = run.filter(|_| scenario.clock == Clock::Realtime) {
         about.insert("run".to_owned(), run.to_string());
         about.insert("plant_pid".to_owned(), std::process::id().to_string());
     }

@@ -48,7 +48,11 @@ pub fn report(arguments: &ReportArguments) -> Result<Ended, Failure> {
 /// [`Failure::Input`] when the folder holds no run, [`Failure::Fault`] when the files cannot be written.
 pub fn write(folder: &Path) -> Result<PathBuf, Failure> {
     let setup = Setup::read(&folder.join("scenario.toml"), &[])?;
-    let recording = recording::Recording::read(&setup, &folder.join("log.mcap"))?;
+    let log = folder.join("log.mcap");
+    let recording = recording::Recording::read(&setup, &log)?;
+    if let Some(damage) = &recording.damage {
+        crate::part::say(&format!("warning: {}: {damage}", log.display()));
+    }
     // A run that broke off early may have no summary; what happened until then can still be looked at.
     let summary = std::fs::read(folder.join("summary.json")).ok();
     let summary = summary.and_then(|bytes| serde_json::from_slice(&bytes).ok()).unwrap_or_default();
