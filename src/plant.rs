@@ -61,12 +61,20 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
     }
     let PlantRun { ending, mut part, log, records } =
         plant_loop.run(&mut robot, &mut membership).map_err(Failure::fault)?;
-    part.log_records_dropped = log.finish()?;
+    let logged = log.finish();
+    part.log_records_dropped = *logged.as_ref().unwrap_or(&0);
+    if part.log_records_dropped > 0 {
+        let lost = part.log_records_dropped;
+        say(&format!(
+            "warning: {lost} records of the log were lost: the machine could not write them in time"
+        ));
+    }
     drop(membership);
     supervisor.stand_in(run);
     let folder = arguments.out.as_deref();
     leave_records(folder, STEP_RECORDS, &records)?;
     leave_part(folder, PLANT_PART, &part)?;
+    logged?;
     ended(ending, "controller")
 }
 
