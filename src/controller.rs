@@ -9,9 +9,8 @@ use delmpc_transport::{Channel, RunId};
 
 use crate::cli::PartArguments;
 use crate::faults::FaultyController;
-use crate::part::{
-    Supervisor, ended, leave_part, leave_records, message_run_id, prepare_machine, run_id, say,
-};
+use crate::output::say;
+use crate::part::{Supervisor, ended, leave_part, leave_records, message_run_id, prepare_machine, run_id};
 use crate::robot_controller::RobotController;
 use crate::run_folder::{CLOCK_READINGS, CONTROLLER_PART, CYCLE_INPUTS, CYCLE_RECORDS};
 use crate::setup::Setup;

@@ -20,13 +20,26 @@ pub fn open_plain(path: &Path) -> io::Result<File> {
     }
 }
 
+/// The text of a plain file of at most `limit` bytes, or of a pipe that the shell or the caller has opened for us, such as `/dev/stdin`.
+///
+/// # Errors
+/// As [`read_text`].
+pub fn read_answerable(path: &Path, limit: u64) -> io::Result<String> {
+    let opened = ["/dev/stdin", "/dev/fd/", "/proc/self/fd/"].iter().any(|place| path.starts_with(place));
+    if opened { read_from(File::open(path)?, limit) } else { read_text(path, limit) }
+}
+
 /// The text of a plain file of at most `limit` bytes.
 ///
 /// # Errors
 /// When it cannot be read, is no plain file, is larger, or is not UTF-8.
 pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
+    read_from(open_plain(path)?, limit)
+}
+
+fn read_from(file: File, limit: u64) -> io::Result<String> {
     let mut text = String::new();
-    open_plain(path)?.take(limit + 1).read_to_string(&mut text)?;
+    file.take(limit + 1).read_to_string(&mut text)?;
     if text.len() as u64 > limit {
         return Err(io::Error::new(ErrorKind::FileTooLarge, format!("it is larger than {limit} bytes")));
     }

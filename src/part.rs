@@ -1,6 +1,5 @@
 //! What `delmpc plant` and `delmpc controller` have in common.
 
-use std::io::Write;
 use std::path::Path;
 
 use bytemuck::Pod;
@@ -16,6 +15,7 @@ use rustix::process::{Pid, getppid};
 use serde::Serialize;
 
 use crate::cli::PartArguments;
+use crate::output::{line, say};
 use crate::setup::Setup;
 use crate::verdict::{Ended, Failure};
 
@@ -81,11 +81,6 @@ impl Supervisor {
     }
 }
 
-/// A line on standard error; that nobody listens is no reason to stop.
-pub fn say(text: &str) {
-    let _ = writeln!(std::io::stderr(), "{text}");
-}
-
 /// Leaves a part of the results in the run's folder, or prints it when there is none.
 ///
 /// # Errors
@@ -93,10 +88,7 @@ pub fn say(text: &str) {
 pub fn leave_part(folder: Option<&Path>, name: &str, part: &impl Serialize) -> Result<(), Failure> {
     let text = serde_json::to_string_pretty(part).map_err(Failure::fault)?;
     match folder {
-        None => {
-            println!("{text}");
-            Ok(())
-        }
+        None => line(&text),
         Some(folder) => {
             let file = folder.join(name);
             // Whole or not at all: the supervisor may look at any time.

@@ -12,9 +12,8 @@ use crate::cli::PartArguments;
 use crate::faults::FaultyPlant;
 use crate::log::{Log, LogHead};
 use crate::log_viewer::LogViewer;
-use crate::part::{
-    Supervisor, ended, leave_part, leave_records, message_run_id, prepare_machine, run_id, say,
-};
+use crate::output::say;
+use crate::part::{Supervisor, ended, leave_part, leave_records, message_run_id, prepare_machine, run_id};
 use crate::plant_process::{PlantLoop, PlantRun};
 use crate::run_folder::{PLANT_PART, ROBOT_FILE, STEP_RECORDS};
 use crate::setup::Setup;

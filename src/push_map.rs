@@ -28,6 +28,7 @@ use serde::Serialize;
 
 use crate::log::Log;
 use crate::one_process::{Simulated, simulate};
+use crate::output::{line, print};
 use crate::setup::{Setup, scenario_file};
 use crate::summary::Summary;
 use crate::verdict::{Ended, Failure};
@@ -133,10 +134,10 @@ pub fn push_map(arguments: &PushMapArguments) -> Result<Ended, Failure> {
     write("push_map.json", &json)?;
     write("push_map.svg", &polar_plot(&limits))?;
     if arguments.json {
-        println!("{json}");
+        line(&json)?;
     } else {
-        print!("{}", table(&limits));
-        println!("{}", folder.display());
+        print(&table(&limits))?;
+        line(folder.display())?;
     }
     Ok(Ended::Well)
 }

@@ -21,6 +21,7 @@ use crate::faults::{FaultyController, FaultyPlant};
 use crate::log::{COMMAND, PULL, STATE, TRUTH, read_command, read_record};
 use crate::log_command;
 use crate::log_reader::{End, Item, LogReader};
+use crate::output::{line, printable};
 use crate::plant_process::{CommandQueue, Plant};
 use crate::robot_controller::RobotController;
 use crate::setup::Setup;
@@ -58,20 +59,23 @@ pub fn replay(arguments: &ReplayArguments) -> Result<Ended, Failure> {
         return Err(Failure::Input(format!("{}: {why}", file.display())));
     }
     if let Some(difference) = replay.difference {
-        say(&format!("{difference}{}", replay.writer))?;
+        line(printable(&format!("{difference}{}", replay.writer)))?;
         return Ok(Ended::CriterionMissed);
     }
     let Counts { states, truths, commands } = replay.counts;
-    say(&format!("the same bits: {truths} steps, {states} states, {commands} commands"))?;
+    line(format!("the same bits: {truths} steps, {states} states, {commands} commands"))?;
     let until_s = replay.truth.time_s();
     if let Some(hole) = replay.hole {
-        say(&format!("compared up to {until_s:.4} s: {hole}"))?;
+        line(format!("compared up to {until_s:.4} s: {hole}"))?;
     } else if let Some(End::Cut(why)) = end {
         let duration_s = setup.scenario.duration_s;
-        say(&format!("compared up to {until_s:.4} s of {duration_s} s: the log is cut there: {why}"))?;
+        line(format!(
+            "compared up to {until_s:.4} s of {duration_s} s: the log is cut there: {}",
+            printable(&why)
+        ))?;
     }
     if setup.scenario.clock == Clock::Realtime {
-        say("commands of a real-time run were taken from the log, not computed again")?;
+        line("commands of a real-time run were taken from the log, not computed again")?;
     }
     Ok(Ended::Well)
 }
@@ -230,8 +234,8 @@ impl<'a> Replay<'a> {
         }
         let (theirs, configuration) = (get(about, "configuration"), get(&ours, "configuration"));
         if theirs != configuration {
-            let line = first_difference(&theirs, &configuration);
-            return Err(self.broken(format!("the log is of another scenario than scenario.toml: {line}")));
+            let place = first_difference(&theirs, &configuration);
+            return Err(self.broken(format!("the log is of another scenario than scenario.toml: {place}")));
         }
         if get(about, "joint_set_hash") != get(&ours, "joint_set_hash") {
             return Err(self.broken("the log is of a robot with other joints than robot.urdf"));
@@ -323,10 +327,4 @@ fn differs(what: &str, time_ns: u64, ours: &[u8], logged: &[u8]) -> Option<Strin
     }
     let byte = ours.iter().zip(logged).position(|(a, b)| a != b).unwrap_or(ours.len().min(logged.len()));
     Some(format!("the {what} at {:.4} s differs from the log, first in byte {byte}", time_ns as f64 * 1e-9))
-}
-
-/// A line on standard output.
-fn say(line: &str) -> Result<(), Failure> {
-    println!("{line}");
-    Ok(())
 }

@@ -11,6 +11,7 @@ use serde::de::DeserializeOwned;
 use crate::cli::{RunArguments, RunOptions};
 use crate::colour::Colour;
 use crate::one_process::run_in_one_process;
+use crate::output::{line, print, say};
 use crate::run_folder::{CONTROLLER_PART, PLANT_PART, RunFolder};
 use crate::setup::{Setup, scenario_file};
 use crate::status_line::StatusLine;
@@ -37,7 +38,7 @@ pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
     let talkative = !options.quiet && !options.json;
     if !options.quiet {
         for warning in scenario.warnings() {
-            eprintln!("warning: {warning}");
+            say(&format!("warning: {warning}"));
         }
     }
     let folder = RunFolder::create(options.out.as_deref(), &scenario.name)?;
@@ -76,23 +77,23 @@ pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
         match crate::report::write(folder.path()) {
             Ok(page) => report = Some(page),
             Err(failure) if options.quiet => drop(failure),
-            Err(failure) => eprintln!("warning: no report: {failure}"),
+            Err(failure) => say(&format!("warning: no report: {failure}")),
         }
     }
 
     if options.json {
-        println!("{}", summary.to_json());
+        line(summary.to_json())?;
     } else if talkative {
         let feet = setup.robot.soles.len();
-        print!("{}", summary_table(&summary, scenario, feet, Colour::of(&std::io::stdout())));
-        println!("{}", report.as_deref().unwrap_or(folder.path()).display());
+        print(&summary_table(&summary, scenario, feet, Colour::of(&std::io::stdout())))?;
+        line(report.as_deref().unwrap_or(folder.path()).display())?;
     }
     match (course, summary.failure) {
         (Course::Interrupted, _) => Ok(Ended::Interrupted),
         (_, Some(failure)) if broke_off => Err(Failure::Fault(failure)),
         (_, Some(failure)) => {
             if options.quiet && !options.json {
-                eprintln!("{failure}");
+                say(&failure);
             }
             Ok(Ended::CriterionMissed)
         }

@@ -207,13 +207,24 @@ impl Supervision {
             .stderr(Stdio::piped())
             .spawn()
             .map_err(|error| Failure::Fault(format!("cannot start the {} process: {error}", role.name())))?;
+        let listener = child.stderr.take().map(|stream| {
+            let (messages, show) = (messages.clone(), self.show_messages);
+            std::thread::Builder::new().spawn(move || pass_on(role, stream, &messages, show))
+        });
+        let listener = match listener.transpose() {
+            Ok(listener) => listener,
+            Err(error) => {
+                let _ = child.kill();
+                let _ = child.wait();
+                return Err(Failure::Fault(format!(
+                    "cannot start a thread for the {} process: {error}",
+                    role.name()
+                )));
+            }
+        };
         if let Some(pipe) = steering {
             *pipe.lock().unwrap_or_else(PoisonError::into_inner) = child.stdin.take();
         }
-        let listener = child.stderr.take().map(|stream| {
-            let (messages, show) = (messages.clone(), self.show_messages);
-            std::thread::spawn(move || pass_on(role, stream, &messages, show))
-        });
         Ok(Watched { role, child, peer, ended: None, listener })
     }
 

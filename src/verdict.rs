@@ -1,8 +1,9 @@
 //! How a command ends.
 
 use std::fmt::Display;
-use std::io::Write;
 use std::process::ExitCode;
+
+use crate::output::say;
 
 /// Why a command did not do what it was asked. Success criteria that were missed are no failure of the command: see [`Ended`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -62,8 +63,7 @@ pub fn exit_code(outcome: Result<Ended, Failure>) -> ExitCode {
     match outcome {
         Ok(ended) => ExitCode::from(ended.status()),
         Err(failure) => {
-            // A reader that is gone is no reason to panic.
-            let _ = writeln!(std::io::stderr(), "delmpc: {failure}");
+            say(&format!("delmpc: {failure}"));
             ExitCode::from(failure.status())
         }
     }

@@ -38,6 +38,7 @@ use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::remove_dead_runs;
 use serde::Serialize;
 
+use crate::output::{line, print};
 use crate::setup::{FAULT_SCENARIO, Setup, scenario_file, scenario_file_or};
 use crate::supervisor::TIDY_UP;
 use crate::timing::criteria::{Criterion, Measured, criteria};
@@ -142,10 +143,10 @@ pub fn timing(arguments: &TimingArguments) -> Result<Ended, Failure> {
     std::fs::write(&file, &json).map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))?;
     pictures::write(&report, &folder)?;
     if arguments.json {
-        println!("{json}");
+        line(&json)?;
     } else {
-        print!("{}", table::table(&report));
-        println!("{}", folder.display());
+        print(&table::table(&report))?;
+        line(folder.display())?;
     }
     verdict(&report)
 }
@@ -164,11 +165,11 @@ fn faults(arguments: &TimingArguments) -> Result<Ended, Failure> {
     let stop = StopFlag::on_signals().map_err(Failure::fault)?;
     remove_dead_runs(TIDY_UP, || stop.is_set());
     if !arguments.json {
-        println!("{}", campaign::head());
+        line(campaign::head())?;
     }
     let tell = |trial: &campaign::Trial| {
         if !arguments.json {
-            println!("{}", campaign::line(trial));
+            let _ = line(campaign::line(trial));
         }
     };
     let trials = campaign::campaign(&setup, &folder, &stop, arguments.clock_jump, tell)?;
@@ -177,9 +178,9 @@ fn faults(arguments: &TimingArguments) -> Result<Ended, Failure> {
     let file = folder.join("faults.json");
     std::fs::write(&file, &json).map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))?;
     if arguments.json {
-        println!("{json}");
+        line(&json)?;
     } else {
-        println!("{}", file.display());
+        line(file.display())?;
     }
     let wrong: Vec<&str> = trials.iter().filter(|t| t.wrong.is_some()).map(|t| t.fault.as_str()).collect();
     if wrong.is_empty() {
@@ -227,7 +228,7 @@ fn all_phases(
     let loads: &[bool] = if arguments.no_load { &[false] } else { &[false, true] };
     let tell = |what: &str| {
         if !arguments.json {
-            crate::part::say(what);
+            crate::output::say(what);
         }
     };
     let (mut idle_floor, mut occupied_floor, mut loops) = (Vec::new(), Vec::new(), Vec::new());

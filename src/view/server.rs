@@ -90,7 +90,8 @@ impl Server {
             ends: AtomicBool::new(false),
         });
         let for_acceptor = shared.clone();
-        let acceptor = Mutex::new(Some(std::thread::spawn(move || accept_all(&listener, &for_acceptor))));
+        let acceptor = std::thread::Builder::new().spawn(move || accept_all(&listener, &for_acceptor));
+        let acceptor = Mutex::new(Some(acceptor.map_err(Failure::fault)?));
         Ok(Self { shared, acceptor })
     }
 

@@ -59,6 +59,18 @@ pub enum LinkError {
         /// The cause.
         source: NodeCreationFailure,
     },
+    /// Shared memory is too short for a run.
+    #[error(
+        "/dev/shm has {} KiB left, {} KiB are needed: make it larger (for a container: --shm-size=64m) or remove what lies there",
+        free / 1024,
+        needed.div_ceil(1024)
+    )]
+    SharedMemoryFull {
+        /// Bytes left.
+        free: u64,
+        /// Bytes needed.
+        needed: u64,
+    },
     /// The peer works with other joints, or the same joints in another order.
     #[error(
         "channel '{channel}': the peer has joint set {found:#018x}, ours is {ours:#018x}: \

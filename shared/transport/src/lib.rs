@@ -50,6 +50,7 @@ mod in_process;
 mod leftovers;
 mod link;
 mod lossy;
+mod memory;
 mod peer_watch;
 mod private_root;
 mod record;

@@ -2,10 +2,10 @@
 
 use std::path::Path;
 use std::thread::sleep;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use iceoryx2::config::Config;
-use iceoryx2::node::{Node, NodeBuilder};
+use iceoryx2::node::{Node, NodeBuilder, NodeCreationFailure};
 use iceoryx2::port::publisher::PublisherCreateError;
 use iceoryx2::port::subscriber::SubscriberCreateError;
 use iceoryx2::prelude::{
@@ -21,6 +21,7 @@ use iceoryx2::service::static_config::messaging_pattern::MessagingPattern as Sta
 
 use crate::abandoned::without_waiting_for_the_lost;
 use crate::leftovers::clear_the_way;
+use crate::memory::{NEEDED, check_free, keep_to_ourselves, reserve};
 use crate::shared_link::MOST_BORROWED;
 use crate::{Channel, LinkError, Payload, RunId, SharedPublisher, SharedSubscriber};
 
@@ -31,9 +32,11 @@ const MAX_PROCESSES: usize = 16;
 const MAX_LOST_PUBLISHERS: usize = 2;
 /// The attribute of a channel that says which joints it is about.
 const JOINT_SET: &str = "joint_set_hash";
-/// A peer that is just being started, ended or cleaned up after a kill makes opening fail for a moment. All attempts together take longer
-/// than it takes until a half-made file counts as lost.
-const CONNECT_ATTEMPTS: u32 = 75;
+/// A peer that is just being started, ended or cleaned up after a kill makes opening fail for a moment; on a machine whose cores are all
+/// taken, for seconds. Longer than it takes until a half-made file counts as lost.
+const CONNECT_PATIENCE: Duration = Duration::from_secs(20);
+/// A place that is taken by a living process stays taken.
+const OCCUPIED_PATIENCE: Duration = Duration::from_millis(1500);
 const CONNECT_PAUSE: Duration = Duration::from_millis(20);
 /// How long iceoryx2 itself waits for a peer that is just making the same channel.
 const CREATION_PATIENCE: Duration = Duration::from_millis(100);
@@ -58,23 +61,25 @@ impl RunNode {
         set_log_level(LogLevel::Fatal); // errors come back as values; standard error belongs to the process
         let config = config_of(run)?;
         clear_the_way(run)?;
+        check_free(NEEDED)?;
         let create = || {
             let node = NodeBuilder::new().config(&config).signal_handling_mode(SignalHandlingMode::Disabled);
             node.create::<ipc::Service>()
         };
         let node = without_waiting_for_the_lost(run, || {
-            let mut node = create();
-            for _ in 1..CONNECT_ATTEMPTS {
-                if node.is_ok() {
-                    break;
+            let begin = Instant::now();
+            loop {
+                match create() {
+                    Err(NodeCreationFailure::InternalError) if begin.elapsed() < CONNECT_PATIENCE => {
+                        sleep(CONNECT_PAUSE);
+                    }
+                    made => break made,
                 }
-                sleep(CONNECT_PAUSE);
-                node = create();
             }
-            node
         });
         let root = run.root_path()?;
         let node = node.map_err(|source| LinkError::NoSharedMemory { run, root, source })?;
+        keep_to_ourselves(run);
         Ok(Self { node, run, joint_set_hash })
     }
 
@@ -82,17 +87,19 @@ impl RunNode {
     ///
     /// # Errors
     /// [`LinkError::JointSetMismatch`], [`LinkError::IncompatiblePayload`], [`LinkError::Occupied`] when the channel has a living
-    /// publisher, [`LinkError::Connect`].
+    /// publisher, [`LinkError::SharedMemoryFull`], [`LinkError::Connect`].
     pub fn publisher<T: Payload>(&self, channel: Channel) -> Result<SharedPublisher<T>, LinkError> {
         without_waiting_for_the_lost(self.run, || {
             let service = self.service::<T>(channel)?;
-            self.insist(|| match service.publisher_builder().create() {
+            let publisher = self.insist(|| match service.publisher_builder().create() {
                 Ok(port) => Attempt::Done(SharedPublisher::new(port, channel.name())),
                 Err(PublisherCreateError::ExceedsMaxSupportedPublishers) => {
                     Attempt::TryAgain(self.occupied(channel, "publisher"))
                 }
                 Err(other) => Attempt::TryAgain(self.refused(channel, &other)),
-            })
+            })?;
+            reserve(self.run)?;
+            Ok(publisher)
         })
     }
 
@@ -143,17 +150,23 @@ impl RunNode {
         })
     }
 
-    /// Tries until it is done, fails for good, or has been tried often enough; between attempts, what dead processes left is removed.
+    /// Tries until it is done, fails for good, or has been tried for long enough; between attempts, what dead processes left is removed.
     fn insist<R>(&self, attempt: impl Fn() -> Attempt<R>) -> Result<R, LinkError> {
-        let mut attempts = 1;
+        let begin = Instant::now();
         loop {
             match attempt() {
                 Attempt::Done(result) => return Ok(result),
                 Attempt::Fail(error) => return Err(error),
-                Attempt::TryAgain(error) if attempts == CONNECT_ATTEMPTS => return Err(error),
-                Attempt::TryAgain(_) => {}
+                Attempt::TryAgain(error) => {
+                    let patience = match error {
+                        LinkError::Occupied { .. } => OCCUPIED_PATIENCE,
+                        _ => CONNECT_PATIENCE,
+                    };
+                    if begin.elapsed() > patience {
+                        return Err(error);
+                    }
+                }
             }
-            attempts += 1;
             self.node.try_cleanup_dead_nodes();
             sleep(CONNECT_PAUSE);
         }

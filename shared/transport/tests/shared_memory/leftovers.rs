@@ -1,7 +1,7 @@
 //! Nothing stays behind.
 
 use std::fs;
-use std::os::unix::fs::symlink;
+use std::os::unix::fs::{PermissionsExt, symlink};
 use std::time::{Duration, Instant, SystemTime};
 
 use delmpc_messages::PlantState;
@@ -90,4 +90,17 @@ fn looking_for_dead_runs_ends_at_once_when_somebody_wants_it() {
     let begin = Instant::now();
     remove_dead_runs(Duration::from_secs(60), || true);
     assert!(begin.elapsed() < Duration::from_secs(5));
+}
+
+#[test]
+fn nothing_of_a_run_is_open_to_others() {
+    let run = TestRun::new();
+    let node = RunNode::open(run.0, HASH).unwrap();
+    let _publisher = node.publisher::<PlantState>(Channel::State).unwrap();
+    let root = runtime_folder().unwrap();
+    assert_eq!(fs::metadata(&root).unwrap().permissions().mode() & 0o777, 0o700);
+    for file in run.files().iter().filter(|file| !file.starts_with(&root)) {
+        let mode = fs::metadata(file).unwrap().permissions().mode() & 0o777;
+        assert_eq!(mode & 0o077, 0, "{mode:o} {}", file.display());
+    }
 }
