@@ -43,6 +43,8 @@ pub enum Ended {
     Well,
     /// A success criterion was missed. Exit status 1.
     CriterionMissed,
+    /// The arguments were wrong, and that was said. Exit status 2.
+    Misused,
     /// Somebody ended it (Ctrl-C). Exit status 130, as shells have it.
     Interrupted,
 }
@@ -53,6 +55,7 @@ impl Ended {
         match self {
             Self::Well => 0,
             Self::CriterionMissed => 1,
+            Self::Misused => 2,
             Self::Interrupted => 130,
         }
     }

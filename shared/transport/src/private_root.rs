@@ -3,7 +3,7 @@
 //! | tried in turn | when |
 //! |---|---|
 //! | `$XDG_RUNTIME_DIR/delmpc`, `/run/user/UID/delmpc` | the folder above is a real one, this user's, closed to others |
-//! | `delmpc-UID` in the folder for temporary files | otherwise |
+//! | `$TMPDIR/delmpc-UID`, `/tmp/delmpc-UID` | otherwise; a path that is relative or too long is passed over |
 //!
 //! Folders for temporary files belong to everybody, and whoever comes first chooses what lies there. So the folder is opened without
 //! following links, and owner and mode are asked of the opened folder, not of its name. What is not a plain folder of this user with
@@ -40,22 +40,27 @@ pub fn runtime_folder() -> Result<PathBuf, LinkError> {
     let usual = PathBuf::from(format!("/run/user/{user}"));
     for runtime in given.into_iter().chain([usual]) {
         let folder = runtime.join("delmpc");
-        if runtime.is_absolute() && fits(&folder) && open_private(&runtime).is_ok() && make(&folder).is_ok() {
+        if fits(&folder) && open_private(&runtime).is_ok() && make(&folder).is_ok() {
             return Ok(folder);
         }
     }
-    let folder = std::env::temp_dir().join(format!("delmpc-{user}"));
-    if !folder.is_absolute() || !fits(&folder) {
-        let why = format!("the path of the folder has to be absolute, and shorter than {LONGEST_ROOT} bytes");
-        let source = io::Error::new(ErrorKind::InvalidInput, why);
-        return Err(LinkError::NoRuntimeFolder { folder, source });
+    let temporary = std::env::var_os("TMPDIR")
+        .map(PathBuf::from)
+        .filter(|folder| fits(&folder.join("delmpc-4294967295")));
+    let places = temporary.into_iter().chain([PathBuf::from("/tmp")]);
+    let mut made =
+        Err(LinkError::NotPrivate { folder: PathBuf::from("/tmp"), what: "it cannot be asked".to_owned() });
+    for folder in places.map(|place| place.join(format!("delmpc-{user}"))) {
+        made = make(&folder).map(|()| folder);
+        if made.is_ok() {
+            break;
+        }
     }
-    make(&folder)?;
-    Ok(folder)
+    made
 }
 
 fn fits(folder: &Path) -> bool {
-    folder.as_os_str().len() < LONGEST_ROOT
+    folder.is_absolute() && folder.as_os_str().len() < LONGEST_ROOT
 }
 
 /// Makes the folder unless it is there, and makes sure that it is private.
