@@ -10,7 +10,9 @@ use delmpc_transport::{Channel, RunId};
 use crate::cli::PartArguments;
 use crate::faults::FaultyController;
 use crate::output::say;
-use crate::part::{Supervisor, ended, leave_part, leave_records, message_run_id, prepare_machine, run_id};
+use crate::part::{
+    Supervisor, ended, leave_part, leave_records, lost_after_s, message_run_id, prepare_machine, run_id,
+};
 use crate::robot_controller::RobotController;
 use crate::run_folder::{CLOCK_READINGS, CONTROLLER_PART, CYCLE_INPUTS, CYCLE_RECORDS};
 use crate::setup::Setup;
@@ -69,7 +71,7 @@ impl ControllerProcess<'_> {
 
         let hash = setup.joint_set_hash();
         let mut membership =
-            Membership::join(run, hash, Role::Controller, arguments.supervised, scenario.process.hang_s)
+            Membership::join(run, hash, Role::Controller, arguments.supervised, lost_after_s(scenario))
                 .map_err(Failure::fault)?;
         if !arguments.supervised {
             say(&format!("run {run}: the controller waits for a plant of the same scenario"));

@@ -1,6 +1,8 @@
 //! What `delmpc plant` and `delmpc controller` have in common.
 
 use std::path::Path;
+use std::thread::sleep;
+use std::time::Duration;
 
 use bytemuck::Pod;
 use delmpc_controller_process::awake::Awake;
@@ -62,6 +64,15 @@ pub fn prepare_machine(role: Role, scenario: &Scenario) -> Option<Awake> {
     awake
 }
 
+/// How long the other process may be silent before it counts as lost; nothing: as long as it lives.
+pub fn lost_after_s(scenario: &Scenario) -> Option<f64> {
+    (scenario.clock == Clock::Realtime).then_some(scenario.process.hang_s)
+}
+
+/// Times a process looks whether it is the last one, and tidies up.
+const STAND_IN_ATTEMPTS: u32 = 10;
+const STAND_IN_PAUSE: Duration = Duration::from_millis(20);
+
 /// Who supervises this process, as long as it lives.
 #[derive(Debug, Clone, Copy)]
 pub struct Supervisor(Option<Pid>);
@@ -76,7 +87,13 @@ impl Supervisor {
     /// the run is dropped; the last process to do so succeeds.
     pub fn stand_in(self, run: RunId) {
         if self.0.is_none() || getppid() != self.0 {
-            let _ = remove_leftovers(run);
+            // The other process may be ending too, and be seen to live still.
+            for _ in 0..STAND_IN_ATTEMPTS {
+                if remove_leftovers(run).is_ok() {
+                    break;
+                }
+                sleep(STAND_IN_PAUSE);
+            }
         }
     }
 }

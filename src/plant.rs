@@ -13,7 +13,9 @@ use crate::faults::FaultyPlant;
 use crate::log::{Log, LogHead};
 use crate::log_viewer::LogViewer;
 use crate::output::say;
-use crate::part::{Supervisor, ended, leave_part, leave_records, message_run_id, prepare_machine, run_id};
+use crate::part::{
+    Supervisor, ended, leave_part, leave_records, lost_after_s, message_run_id, prepare_machine, run_id,
+};
 use crate::plant_process::{PlantLoop, PlantRun};
 use crate::run_folder::{PLANT_PART, ROBOT_FILE, STEP_RECORDS};
 use crate::setup::Setup;
@@ -41,7 +43,7 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
 
     let hash = setup.joint_set_hash();
     let mut membership =
-        Membership::join(run, hash, Role::Plant, arguments.supervised, scenario.process.hang_s)
+        Membership::join(run, hash, Role::Plant, arguments.supervised, lost_after_s(scenario))
             .map_err(Failure::fault)?;
     if !arguments.supervised {
         say(&format!("run {run}: the plant waits for a controller of the same scenario"));

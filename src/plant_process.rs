@@ -461,7 +461,9 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
     ) -> Result<(), PlantFault> {
         self.send_state(plant, status::FINISHED)?;
         let begin_ns = monotonic_ns();
-        while !membership.peer_is_done() && monotonic_ns() < begin_ns + FAREWELL_NS {
+        // In lockstep nothing is decided by the wall clock: whoever is gone or wants the end says so.
+        let lockstep = self.scenario.clock == Clock::Lockstep;
+        while !membership.peer_is_done() && (lockstep || monotonic_ns() < begin_ns + FAREWELL_NS) {
             if membership.attend()?.ends() {
                 break;
             }

@@ -124,6 +124,7 @@ fn run_in_two_processes(
         steering: view.as_ref().map(View::pipe),
         show_messages: talkative,
         hang_s: setup.scenario.process.hang_s,
+        lockstep: setup.scenario.clock == Clock::Lockstep,
         restarts: 0,
         late: None,
     };

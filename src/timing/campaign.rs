@@ -227,6 +227,7 @@ fn supervision(setup: &Setup, folder: &RunFolder, fault: &FaultSettings) -> Resu
         steering: None,
         show_messages: false,
         hang_s: setup.scenario.process.hang_s,
+        lockstep: setup.scenario.clock == Clock::Lockstep,
         restarts: u32::from(fault.kind == FaultKind::Kill),
         late: (fault.kind == FaultKind::LateStart).then_some((role, fault.size_s)),
     })

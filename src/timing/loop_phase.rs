@@ -59,6 +59,7 @@ pub fn run_loop(setup: &Setup, folder: &Path, stop: &StopFlag) -> Result<LoopRun
         steering: None,
         show_messages: false,
         hang_s: scenario.process.hang_s,
+        lockstep: false,
         restarts: 0,
         late: None,
     };

@@ -38,9 +38,11 @@ fn remove(folder: BorrowedFd<'_>, name: &CString, depth: u32) -> io::Result<usiz
     }
     let mut removed = 0;
     if depth > 0 {
-        let inside = openat(folder, name, FOLDER, Mode::empty())?;
-        for entry in names(inside.as_fd())? {
-            removed += remove(inside.as_fd(), &entry, depth - 1)?;
+        // Somebody else may be at the same work.
+        if let Some(inside) = still_there(openat(folder, name, FOLDER, Mode::empty()))? {
+            for entry in names(inside.as_fd())? {
+                removed += remove(inside.as_fd(), &entry, depth - 1)?;
+            }
         }
     }
     gone(unlinkat(folder, name, AtFlags::REMOVEDIR))?;
@@ -58,8 +60,9 @@ fn remove_strange_to(folder: BorrowedFd<'_>, depth: u32) -> io::Result<()> {
         match kind(&found) {
             FileType::RegularFile if is_ours(&found) => {}
             FileType::Directory if is_ours(&found) && depth > 0 => {
-                let inside = openat(folder, &name, FOLDER, Mode::empty())?;
-                remove_strange_to(inside.as_fd(), depth - 1)?;
+                if let Some(inside) = still_there(openat(folder, &name, FOLDER, Mode::empty()))? {
+                    remove_strange_to(inside.as_fd(), depth - 1)?;
+                }
             }
             _ => {
                 remove(folder, &name, DEEPEST)?;
@@ -92,6 +95,15 @@ fn names(folder: BorrowedFd<'_>) -> io::Result<Vec<CString>> {
         }
     }
     Ok(names)
+}
+
+/// What was opened, unless it is gone by now.
+fn still_there(opened: rustix::io::Result<OwnedFd>) -> io::Result<Option<OwnedFd>> {
+    match opened {
+        Ok(opened) => Ok(Some(opened)),
+        Err(Errno::NOENT) => Ok(None),
+        Err(error) => Err(error.into()),
+    }
 }
 
 /// Whether it was there to be removed.
