@@ -37,7 +37,7 @@ pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
     }
     let talkative = !options.quiet && !options.json;
     if !options.quiet {
-        for warning in scenario.warnings() {
+        for warning in setup.notes.iter().cloned().chain(scenario.warnings()) {
             say(&format!("warning: {warning}"));
         }
     }

@@ -22,6 +22,8 @@ pub struct Setup {
     pub robot: RobotModel,
     /// Where the robot was found.
     pub urdf: PathBuf,
+    /// What should be known of the overrides.
+    pub notes: Vec<String>,
 }
 
 impl Setup {
@@ -37,7 +39,8 @@ impl Setup {
         let scenario = document.scenario().map_err(Failure::input)?;
         let urdf = find_robot(file, &scenario.robot.urdf);
         let robot = load(&urdf).map_err(Failure::input)?;
-        let setup = Self { scenario, robot, urdf };
+        let notes = document.notes().to_vec();
+        let setup = Self { scenario, robot, urdf, notes };
         setup.check_names().map_err(|error| Failure::Input(format!("{}: {error}", file.display())))?;
         Ok(setup)
     }
