@@ -11,7 +11,8 @@ use crate::cli::PartArguments;
 use crate::faults::FaultyController;
 use crate::output::say;
 use crate::part::{
-    Supervisor, ended, leave_part, leave_records, lost_after_s, message_run_id, prepare_machine, run_id,
+    PartFolder, Supervisor, ended, leave_part, leave_records, lost_after_s, message_run_id, prepare_machine,
+    run_id,
 };
 use crate::robot_controller::RobotController;
 use crate::run_folder::{CLOCK_READINGS, CONTROLLER_PART, CYCLE_INPUTS, CYCLE_RECORDS};
@@ -66,6 +67,7 @@ impl ControllerProcess<'_> {
     fn run<C: Controller>(&self, controller: C) -> Result<(Ended, C), Failure> {
         let Self { arguments, setup, run, supervisor, allocations } = *self;
         let scenario = &setup.scenario;
+        let part_folder = PartFolder::enter(arguments, Role::Controller, setup)?;
         let mut controller = FaultyController::new(controller, scenario);
         let _awake = prepare_machine(Role::Controller, scenario);
 
@@ -93,7 +95,8 @@ impl ControllerProcess<'_> {
         let folder = arguments.out.as_deref();
         leave_records(folder, CYCLE_RECORDS, &records)?;
         leave_part(folder, CONTROLLER_PART, &part(scenario, &figures))?;
-        Ok((ended(ending, "plant")?, controller.into_inner()))
+        let ended = part_folder.leave(setup, ended(ending, "plant")?)?;
+        Ok((ended, controller.into_inner()))
     }
 }
 

@@ -15,10 +15,15 @@ use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::{RunId, remove_leftovers};
 use rustix::process::{Pid, getppid};
 use serde::Serialize;
+use serde::de::DeserializeOwned;
 
 use crate::cli::PartArguments;
-use crate::output::{line, say};
+use crate::colour::Colour;
+use crate::output::{line, print, say};
+use crate::run_folder::{CONTROLLER_PART, PLANT_PART, RunFolder};
 use crate::setup::Setup;
+use crate::summary::Summary;
+use crate::summary_table::summary_table;
 use crate::verdict::{Ended, Failure};
 
 /// The run a process belongs to: the named one, or one made from the scenario, so that two processes of the same scenario meet.
@@ -94,6 +99,85 @@ impl Supervisor {
                 }
                 sleep(STAND_IN_PAUSE);
             }
+        }
+    }
+}
+
+/// The folder of the results of a process that is nobody's child, if it has one.
+#[derive(Debug)]
+pub struct PartFolder(Option<RunFolder>);
+
+impl PartFolder {
+    /// Makes or enters the folder.
+    ///
+    /// # Errors
+    /// As [`RunFolder::join`].
+    pub fn enter(arguments: &PartArguments, role: Role, setup: &Setup) -> Result<Self, Failure> {
+        match &arguments.out {
+            Some(path) if !arguments.supervised => Ok(Self(Some(RunFolder::join(path, role, setup)?))),
+            _ => Ok(Self(None)),
+        }
+    }
+
+    /// The process has left its part; the last one puts both together as `delmpc run` does: summary, report, table.
+    ///
+    /// # Errors
+    /// [`Failure::Fault`] when the summary cannot be written.
+    pub fn leave(self, setup: &Setup, ended: Ended) -> Result<Ended, Failure> {
+        match self.0.filter(RunFolder::is_left_by_the_last) {
+            None => Ok(ended),
+            Some(folder) => {
+                let interrupted = (ended == Ended::Interrupted).then(|| "interrupted".to_owned());
+                let summary = summarize(setup, &folder, interrupted)?;
+                let shown = match crate::report::write(folder.path()) {
+                    Ok(page) => page,
+                    Err(failure) => {
+                        say(&format!("warning: no report: {failure}"));
+                        folder.path().to_owned()
+                    }
+                };
+                let feet = setup.robot.soles.len();
+                let colour = Colour::of(&std::io::stdout());
+                print(&summary_table(&summary, &setup.scenario, feet, colour))?;
+                line(shown.display())?;
+                match (ended, summary.success) {
+                    (Ended::Well, false) => Ok(Ended::CriterionMissed),
+                    _ => Ok(ended),
+                }
+            }
+        }
+    }
+}
+
+/// Puts the parts that two processes left in a folder together, and writes `summary.json`. `fault`: why the run broke off, if it did.
+///
+/// # Errors
+/// [`Failure::Fault`] when the summary cannot be written.
+pub fn summarize(setup: &Setup, folder: &RunFolder, fault: Option<String>) -> Result<Summary, Failure> {
+    let (mut plant, mut controller, mut fault) = (None, None, fault);
+    match (take_part(&folder.file(PLANT_PART)), take_part(&folder.file(CONTROLLER_PART))) {
+        (Ok(plant_part), Ok(controller_part)) => (plant, controller) = (plant_part, controller_part),
+        (Err(error), _) | (_, Err(error)) => fault = fault.or(Some(error)),
+    }
+    if plant.is_none() || controller.is_none() {
+        fault = fault.or(Some("a process left no figures".to_owned()));
+    }
+    let summary = Summary::new(&setup.scenario, plant, controller, fault);
+    let written = summary.write(&folder.file("summary.json"));
+    written.map_err(|error| Failure::Fault(format!("summary.json: {error}")))?;
+    Ok(summary)
+}
+
+/// Reads a process's part of the results and removes the file; `None` when the process left none.
+fn take_part<T: DeserializeOwned>(file: &Path) -> Result<Option<T>, String> {
+    let wrong = |error: &dyn std::fmt::Display| format!("{}: {error}", file.display());
+    match std::fs::read_to_string(file) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(wrong(&error)),
+        Ok(text) => {
+            let part = serde_json::from_str(&text).map_err(|error| wrong(&error))?;
+            std::fs::remove_file(file).map_err(|error| wrong(&error))?;
+            Ok(Some(part))
         }
     }
 }

@@ -5,7 +5,7 @@ use std::io::BufReader;
 
 use delmpc_controller_process::membership::Membership;
 use delmpc_messages::{PlantState, Role};
-use delmpc_scenario::{Clock, Scenario};
+use delmpc_scenario::Clock;
 use delmpc_transport::{Channel, RunId};
 
 use crate::cli::PartArguments;
@@ -14,10 +14,11 @@ use crate::log::{Log, LogHead};
 use crate::log_viewer::LogViewer;
 use crate::output::say;
 use crate::part::{
-    Supervisor, ended, leave_part, leave_records, lost_after_s, message_run_id, prepare_machine, run_id,
+    PartFolder, Supervisor, ended, leave_part, leave_records, lost_after_s, message_run_id, prepare_machine,
+    run_id,
 };
 use crate::plant_process::{PlantLoop, PlantRun};
-use crate::run_folder::{PLANT_PART, ROBOT_FILE, STEP_RECORDS};
+use crate::run_folder::{PLANT_PART, STEP_RECORDS, effective};
 use crate::setup::Setup;
 use crate::simulated_robot::SimulatedRobot;
 use crate::steering::Steering;
@@ -33,6 +34,7 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
     let scenario = &setup.scenario;
     let run = run_id(arguments, &setup)?;
     let mut robot = FaultyPlant::new(SimulatedRobot::new(&setup)?, scenario);
+    let part = PartFolder::enter(arguments, Role::Plant, &setup)?;
     let log = match &arguments.out {
         Some(folder) if !arguments.timing => {
             Log::create(&folder.join("log.mcap"), log_head(&setup, run), scenario.clock == Clock::Lockstep)?
@@ -60,12 +62,12 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
     if arguments.timing {
         plant_loop = plant_loop.recording();
     }
-    let PlantRun { ending, mut part, log, records } =
+    let PlantRun { ending, part: mut figures, log, records } =
         plant_loop.run(&mut robot, &mut membership).map_err(Failure::fault)?;
     let logged = log.finish();
-    part.log_records_dropped = *logged.as_ref().unwrap_or(&0);
-    if part.log_records_dropped > 0 {
-        let lost = part.log_records_dropped;
+    figures.log_records_dropped = *logged.as_ref().unwrap_or(&0);
+    if figures.log_records_dropped > 0 {
+        let lost = figures.log_records_dropped;
         say(&format!(
             "warning: {lost} records of the log were lost: the machine could not write them in time"
         ));
@@ -74,31 +76,22 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
     supervisor.stand_in(run);
     let folder = arguments.out.as_deref();
     leave_records(folder, STEP_RECORDS, &records)?;
-    leave_part(folder, PLANT_PART, &part)?;
+    leave_part(folder, PLANT_PART, &figures)?;
     logged?;
-    ended(ending, "controller")
+    part.leave(&setup, ended(ending, "controller")?)
 }
 
 /// What the log says about its run. In lockstep only what is the same in every run of the seed.
 pub fn log_head(setup: &Setup, run: RunId) -> LogHead {
     let mut files = setup.robot_files();
-    files.insert(
-        0,
-        ("scenario.toml".to_owned(), "application/toml", effective_scenario(setup).to_toml().into_bytes()),
-    );
+    files
+        .insert(0, ("scenario.toml".to_owned(), "application/toml", effective(setup).to_toml().into_bytes()));
     LogHead { about: about(setup, Some(run)), files, viewer: Some(LogViewer::new(setup)) }
-}
-
-/// The scenario as it is in the run's folder.
-fn effective_scenario(setup: &Setup) -> Scenario {
-    let mut scenario = setup.scenario.clone();
-    scenario.robot.urdf = ROBOT_FILE.to_owned();
-    scenario
 }
 
 /// What identifies a run; in real time, if `run` is given, also what is of this one only.
 pub fn about(setup: &Setup, run: Option<RunId>) -> BTreeMap<String, String> {
-    let scenario = effective_scenario(setup);
+    let scenario = effective(setup);
     let mut about = BTreeMap::from([
         ("program".to_owned(), concat!("delmpc ", env!("CARGO_PKG_VERSION")).to_owned()),
         ("scenario".to_owned(), scenario.name.clone()),

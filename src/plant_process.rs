@@ -372,6 +372,10 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
             if order.ends() {
                 return Ok(Some(order));
             }
+            if membership.peer_is_done() {
+                // What it sent before its end is there by now.
+                return Ok((self.receive()? != Some(sequence)).then_some(Order::PeerLost));
+            }
             self.states.serve_newcomers()?;
             sleep(PAUSE);
         }

@@ -6,16 +6,17 @@ use std::path::Path;
 use delmpc_controller_process::stop::StopFlag;
 use delmpc_scenario::Clock;
 use delmpc_transport::remove_dead_runs;
-use serde::de::DeserializeOwned;
 
 use crate::cli::{RunArguments, RunOptions};
 use crate::colour::Colour;
 use crate::one_process::run_in_one_process;
 use crate::output::{line, print, say};
-use crate::run_folder::{CONTROLLER_PART, PLANT_PART, RunFolder};
+use crate::part::summarize;
+use crate::robot_controller::RobotController;
+use crate::run_folder::RunFolder;
 use crate::setup::{Setup, scenario_file};
+use crate::simulated_robot::SimulatedRobot;
 use crate::status_line::StatusLine;
-use crate::summary::Summary;
 use crate::summary_table::summary_table;
 use crate::supervisor::{Course, Supervision, TIDY_UP, fresh_run};
 use crate::verdict::{Ended, Failure};
@@ -41,6 +42,11 @@ pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
             say(&format!("warning: {warning}"));
         }
     }
+    if !options.one_process {
+        // What either process would refuse is refused here, before anything is overwritten or started.
+        RobotController::new(&setup)?;
+        SimulatedRobot::new(&setup)?;
+    }
     let folder = RunFolder::create(options.out.as_deref(), &scenario.name)?;
     folder.write_inputs(&setup)?;
     let stop = StopFlag::on_signals().map_err(Failure::fault)?;
@@ -51,23 +57,14 @@ pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
     } else {
         run_in_two_processes(&setup, &folder, &stop, options, &mut view)?
     };
-    let (mut plant, mut controller) = (None, None);
-    let mut fault = match course {
+    let fault = match course {
         Course::Finished => None,
         Course::Interrupted => Some("interrupted".to_owned()),
         Course::Fault(ref why) => Some(why.clone()),
     };
-    match (take_part(&folder.file(PLANT_PART)), take_part(&folder.file(CONTROLLER_PART))) {
-        (Ok(plant_part), Ok(controller_part)) => (plant, controller) = (plant_part, controller_part),
-        (Err(error), _) | (_, Err(error)) => fault = fault.or(Some(error)),
-    }
-    if plant.is_none() || controller.is_none() {
-        fault = fault.or(Some("a process left no figures".to_owned()));
-    }
-    let broke_off = fault.is_some();
-    let summary = Summary::new(scenario, plant, controller, fault);
-    let written = summary.write(&folder.file("summary.json"));
-    written.map_err(|error| Failure::Fault(format!("summary.json: {error}")))?;
+    let finished = fault.is_none();
+    let summary = summarize(&setup, &folder, fault)?;
+    let broke_off = !finished || summary.plant.is_none() || summary.controller.is_none();
     if let Some(view) = view {
         view.finish(summary.success, summary.failure.as_deref());
     }
@@ -145,20 +142,6 @@ fn run_in_two_processes(
         let _ = write!(std::io::stderr(), "\r\x1b[K");
     }
     course
-}
-
-/// Reads a process's part of the results and removes the file; `None` when the process left none.
-fn take_part<T: DeserializeOwned>(file: &Path) -> Result<Option<T>, String> {
-    let wrong = |error: &dyn std::fmt::Display| format!("{}: {error}", file.display());
-    match std::fs::read_to_string(file) {
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
-        Err(error) => Err(wrong(&error)),
-        Ok(text) => {
-            let part = serde_json::from_str(&text).map_err(|error| wrong(&error))?;
-            std::fs::remove_file(file).map_err(|error| wrong(&error))?;
-            Ok(Some(part))
-        }
-    }
 }
 
 fn text(path: &Path) -> Result<String, Failure> {

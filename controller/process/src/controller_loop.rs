@@ -129,7 +129,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
                 return Ok(Ending::Ordered(order));
             }
             let news = self.receive()?;
-            if self.plant_is_done() {
+            if self.plant_is_done() || (!news && membership.peer_is_done()) {
                 return Ok(Ending::Finished);
             }
             if !running && self.state.header.sequence > 1 {
@@ -165,6 +165,10 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
                 return Ok(Ending::Ordered(order));
             }
             if !self.receive()? {
+                // It said so without us having seen its last state.
+                if membership.peer_is_done() {
+                    return Ok(Ending::Finished);
+                }
                 self.commands.serve_newcomers()?;
                 sleep(PAUSE);
                 continue;

@@ -35,8 +35,8 @@ const JOINT_SET: &str = "joint_set_hash";
 /// A peer that is just being started, ended or cleaned up after a kill makes opening fail for a moment; on a machine whose cores are all
 /// taken, for seconds. Longer than it takes until a half-made file counts as lost.
 const CONNECT_PATIENCE: Duration = Duration::from_secs(20);
-/// A place that is taken by a living process stays taken.
-const OCCUPIED_PATIENCE: Duration = Duration::from_millis(1500);
+/// A place that is taken by a living process stays taken, and memory that cannot be had is not there a moment later.
+const PORT_PATIENCE: Duration = Duration::from_millis(1500);
 const CONNECT_PAUSE: Duration = Duration::from_millis(20);
 /// How long iceoryx2 itself waits for a peer that is just making the same channel.
 const CREATION_PATIENCE: Duration = Duration::from_millis(100);
@@ -91,7 +91,7 @@ impl RunNode {
     pub fn publisher<T: Payload>(&self, channel: Channel) -> Result<SharedPublisher<T>, LinkError> {
         without_waiting_for_the_lost(self.run, || {
             let service = self.service::<T>(channel)?;
-            let publisher = self.insist(|| match service.publisher_builder().create() {
+            let publisher = self.insist(PORT_PATIENCE, || match service.publisher_builder().create() {
                 Ok(port) => Attempt::Done(SharedPublisher::new(port, channel.name())),
                 Err(PublisherCreateError::ExceedsMaxSupportedPublishers) => {
                     Attempt::TryAgain(self.occupied(channel, "publisher"))
@@ -110,7 +110,7 @@ impl RunNode {
     pub fn subscriber<T: Payload>(&self, channel: Channel) -> Result<SharedSubscriber<T>, LinkError> {
         without_waiting_for_the_lost(self.run, || {
             let service = self.service::<T>(channel)?;
-            self.insist(|| match service.subscriber_builder().create() {
+            self.insist(PORT_PATIENCE, || match service.subscriber_builder().create() {
                 Ok(port) => Attempt::Done(SharedSubscriber::new(port, channel.name())),
                 Err(SubscriberCreateError::ExceedsMaxSupportedSubscribers) => {
                     Attempt::TryAgain(self.occupied(channel, "subscriber"))
@@ -129,7 +129,7 @@ impl RunNode {
     fn service<T: Payload>(&self, channel: Channel) -> Result<PortFactory<ipc::Service, T, ()>, LinkError> {
         let name = self.service_name(channel)?;
         let required = self.required_attributes(channel)?;
-        self.insist(|| {
+        self.insist(CONNECT_PATIENCE, || {
             let opened = self
                 .node
                 .service_builder(&name)
@@ -151,21 +151,14 @@ impl RunNode {
     }
 
     /// Tries until it is done, fails for good, or has been tried for long enough; between attempts, what dead processes left is removed.
-    fn insist<R>(&self, attempt: impl Fn() -> Attempt<R>) -> Result<R, LinkError> {
+    fn insist<R>(&self, patience: Duration, attempt: impl Fn() -> Attempt<R>) -> Result<R, LinkError> {
         let begin = Instant::now();
         loop {
             match attempt() {
                 Attempt::Done(result) => return Ok(result),
                 Attempt::Fail(error) => return Err(error),
-                Attempt::TryAgain(error) => {
-                    let patience = match error {
-                        LinkError::Occupied { .. } => OCCUPIED_PATIENCE,
-                        _ => CONNECT_PATIENCE,
-                    };
-                    if begin.elapsed() > patience {
-                        return Err(error);
-                    }
-                }
+                Attempt::TryAgain(error) if begin.elapsed() > patience => return Err(error),
+                Attempt::TryAgain(_) => {}
             }
             self.node.try_cleanup_dead_nodes();
             sleep(CONNECT_PAUSE);
