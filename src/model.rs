@@ -169,6 +169,15 @@ fn read_question(file: &Path) -> Result<Question, Failure> {
     serde_json::from_str(&text).map_err(|error| Failure::Input(format!("{name}: {error}")))
 }
 
+/// The answer to the text of a file of `--at`, as JSON; base and gravity are those of `robot`.
+///
+/// # Errors
+/// What is wrong with the question, in words.
+pub fn answer_to(robot: &RobotModel, text: &str) -> Result<String, String> {
+    let question: Question = serde_json::from_str(text).map_err(|error| error.to_string())?;
+    in_numbers(&answer(robot, &question)?)
+}
+
 /// An answer as JSON.
 ///
 /// # Errors
