@@ -85,7 +85,10 @@ impl Log {
     /// When the file cannot be made.
     pub fn create(path: &Path, head: LogHead, waits: bool) -> Result<Self, Failure> {
         let cannot = |error: io::Error| Failure::Fault(format!("{}: {error}", path.display()));
-        let (sender, receiver) = queue(if waits { LOCKSTEP_RING } else { REALTIME_RING });
+        let room = if waits { LOCKSTEP_RING } else { REALTIME_RING };
+        let (sender, receiver) = queue(room).map_err(|error| {
+            Failure::Fault(format!("no memory for the log, {} MB are needed: {error}", room >> 20))
+        })?;
         let (file, channels) = begin(path, &head).map_err(cannot)?;
         let viewer = head.viewer;
         let writer = std::thread::Builder::new()

@@ -3,6 +3,7 @@
 //! The loop copies a record into a ring and goes on: no lock, no system call, no allocation. When the ring is full, the record is refused,
 //! or waited for.
 
+use std::collections::TryReserveError;
 use std::thread::sleep;
 use std::time::Duration;
 
@@ -35,7 +36,12 @@ pub struct Sender(Producer<u8>);
 pub struct Receiver(Consumer<u8>);
 
 /// Makes a ring of `capacity` bytes, every page of it touched.
-pub fn queue(capacity: usize) -> (Sender, Receiver) {
+///
+/// # Errors
+/// When there is not so much memory.
+pub fn queue(capacity: usize) -> Result<(Sender, Receiver), TryReserveError> {
+    // Asked first: a ring that cannot be made ends the process.
+    Vec::<u8>::new().try_reserve_exact(capacity)?;
     let (mut sender, mut receiver) = RingBuffer::new(capacity);
     // Once round the ring: what is written later touches no fresh page.
     if let Ok(chunk) = sender.write_chunk(capacity) {
@@ -44,7 +50,7 @@ pub fn queue(capacity: usize) -> (Sender, Receiver) {
     if let Ok(chunk) = receiver.read_chunk(capacity) {
         chunk.commit_all();
     }
-    (Sender(sender), Receiver(receiver))
+    Ok((Sender(sender), Receiver(receiver)))
 }
 
 impl Sender {
@@ -115,7 +121,7 @@ mod tests {
 
     #[test]
     fn records_of_any_length_come_out_in_order_and_whole_and_the_end_is_told() {
-        let (mut sender, mut receiver) = queue(1000);
+        let (mut sender, mut receiver) = queue(1000).unwrap();
         let writer = std::thread::spawn(move || {
             let mut content = Vec::new();
             let mut seen = 0;
@@ -138,7 +144,7 @@ mod tests {
 
     #[test]
     fn what_has_no_room_is_refused_whole_and_what_can_never_come_is_not_waited_for() {
-        let (mut sender, receiver) = queue(100);
+        let (mut sender, receiver) = queue(100).unwrap();
         assert!(sender.send(head(0), &[&[1; 60]]));
         assert!(!sender.send(head(1), &[&[1; 60]]));
         assert!(!sender.send(head(1), &[&[1; 600]]));
