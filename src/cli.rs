@@ -171,7 +171,8 @@ pub enum Command {
     /// Run again from the log of a run and compare bit by bit
     ///
     /// The plant is given every logged command where it came; each state and truth must come out as logged. In lockstep the
-    /// controller is given every logged state, and each command must come out as logged.
+    /// controller is given every logged state, and each command must come out as logged. Of a log that is cut or has a hole, what is
+    /// before that is compared, and the time is told.
     #[command(after_long_help = REPLAY_EXAMPLES)]
     Replay(ReplayArguments),
     /// Make report.html and the plots of a run again from its files
@@ -188,7 +189,7 @@ pub enum Command {
 /// Options of `delmpc run`.
 #[derive(Debug, Clone, Default, Args)]
 pub struct RunOptions {
-    /// Folder of the run [default: runs/SCENARIO-TIME, to which runs/latest then points]
+    /// Folder of the run, new, empty or of an earlier run [default: runs/SCENARIO-TIME, to which runs/latest then points]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Override a key of the scenario, for example --set plant.friction=0.4; may be given several times
@@ -236,7 +237,7 @@ pub struct PartArguments {
     /// Run that the process belongs to, 16 hexadecimal digits [default: made from the scenario, the same for both]
     #[arg(long, value_name = "ID")]
     pub run_id: Option<String>,
-    /// Folder for the process's part of the results
+    /// Folder of the run, the same for both: new, empty or of an earlier run. The one that ends last writes summary and report
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// A supervisor starts, watches and ends this process

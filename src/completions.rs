@@ -4,6 +4,7 @@ use clap::CommandFactory;
 use clap_complete::{Shell, generate};
 
 use crate::cli::Cli;
+use crate::output::print;
 use crate::verdict::{Ended, Failure};
 
 /// Arguments of `delmpc completions`.
@@ -16,10 +17,10 @@ pub struct CompletionsArguments {
 /// Runs the command.
 ///
 /// # Errors
-/// None: what cannot be written, nobody reads.
+/// [`Failure::Fault`] when it cannot be written.
 pub fn completions(arguments: &CompletionsArguments) -> Result<Ended, Failure> {
     let mut script = Vec::new();
     generate(arguments.shell, &mut Cli::command(), "delmpc", &mut script);
-    print!("{}", String::from_utf8_lossy(&script));
+    print(&String::from_utf8_lossy(&script))?;
     Ok(Ended::Well)
 }

@@ -9,8 +9,10 @@ use delmpc_transport::{Channel, RunId};
 
 use crate::cli::PartArguments;
 use crate::faults::FaultyController;
+use crate::output::say;
 use crate::part::{
-    Supervisor, ended, leave_part, leave_records, message_run_id, prepare_machine, run_id, say,
+    PartFolder, Supervisor, ended, leave_part, leave_records, lost_after_s, message_run_id, prepare_machine,
+    run_id,
 };
 use crate::robot_controller::RobotController;
 use crate::run_folder::{CLOCK_READINGS, CONTROLLER_PART, CYCLE_INPUTS, CYCLE_RECORDS};
@@ -65,12 +67,13 @@ impl ControllerProcess<'_> {
     fn run<C: Controller>(&self, controller: C) -> Result<(Ended, C), Failure> {
         let Self { arguments, setup, run, supervisor, allocations } = *self;
         let scenario = &setup.scenario;
+        let part_folder = PartFolder::enter(arguments, Role::Controller, setup)?;
         let mut controller = FaultyController::new(controller, scenario);
         let _awake = prepare_machine(Role::Controller, scenario);
 
         let hash = setup.joint_set_hash();
         let mut membership =
-            Membership::join(run, hash, Role::Controller, arguments.supervised, scenario.process.hang_s)
+            Membership::join(run, hash, Role::Controller, arguments.supervised, lost_after_s(scenario))
                 .map_err(Failure::fault)?;
         if !arguments.supervised {
             say(&format!("run {run}: the controller waits for a plant of the same scenario"));
@@ -92,7 +95,8 @@ impl ControllerProcess<'_> {
         let folder = arguments.out.as_deref();
         leave_records(folder, CYCLE_RECORDS, &records)?;
         leave_part(folder, CONTROLLER_PART, &part(scenario, &figures))?;
-        Ok((ended(ending, "plant")?, controller.into_inner()))
+        let ended = part_folder.leave(setup, ended(ending, "plant")?)?;
+        Ok((ended, controller.into_inner()))
     }
 }
 
@@ -100,11 +104,11 @@ impl ControllerProcess<'_> {
 /// machine: in lockstep they are left out, so that runs are reproducible.
 pub fn part(scenario: &Scenario, figures: &CycleFigures) -> ControllerPart {
     let realtime = scenario.clock == Clock::Realtime;
-    let [p50, p99, p999, max] = figures.percentiles_s(|cycle| cycle.total_ns, [0.5, 0.99, 0.999, 1.0]);
-    let [feedback_p50, feedback_p99] = figures.percentiles_s(|cycle| cycle.feedback_ns, [0.5, 0.99]);
-    let [linearize] = figures.percentiles_s(|cycle| cycle.linearize_ns, [0.5]);
-    let [riccati] = figures.percentiles_s(|cycle| cycle.riccati_ns, [0.5]);
-    let [qp] = figures.percentiles_s(|cycle| cycle.qp_ns, [0.5]);
+    let durations = figures.durations();
+    let [p50, p99, p999, max] = [0.5, 0.99, 0.999, 1.0].map(|part| durations.total.percentile_s(part));
+    let [feedback_p50, feedback_p99] = [0.5, 0.99].map(|part| durations.feedback.percentile_s(part));
+    let [linearize, riccati, qp] =
+        [&durations.linearize, &durations.riccati, &durations.qp].map(|stage| stage.percentile_s(0.5));
     let timed = |value: Option<f64>| value.filter(|_| realtime);
     let verdicts = |verdict: Verdict| figures.verdicts[verdict as usize];
     ControllerPart {

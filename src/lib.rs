@@ -7,6 +7,8 @@
 //! |---|---|
 //! | [`cli`] | arguments |
 //! | [`verdict`] | how a command ends: exit status and message |
+//! | [`output`] | what is written to terminals and pipes |
+//! | [`input_file`] | files that are given to us |
 //! | [`setup`] | scenario and robot from their files, checked against each other |
 //! | [`simulated_robot`], [`robot_controller`] | plant and controller made from a setup |
 //! | [`faults`] | faults of messages on purpose |
@@ -22,6 +24,7 @@
 //! | [`drawing`] | a robot in its postures as SVG |
 //! | [`completions`] | what a shell needs to complete our words |
 //! | [`log`], [`log_viewer`] | the log of states, commands and truth, and what shows the robot to viewers of logs |
+//! | [`log_queue`], [`log_file`], [`log_command`], [`log_reader`] | its way to the file, the file, commands in it, and its way back |
 //! | [`mod@report`] | the run to look at: `report.html` and pictures of the key plots |
 //! | [`steering`] | what a person does to a running plant |
 //! | [`view`] | the live page: watch, pull, pause |
@@ -35,12 +38,18 @@ pub mod completions;
 pub mod controller;
 pub mod drawing;
 pub mod faults;
+pub mod input_file;
 pub mod log;
+pub mod log_command;
+pub mod log_file;
+pub mod log_queue;
+pub mod log_reader;
 pub mod log_viewer;
 pub mod metrics;
 pub mod model;
 pub mod observer;
 pub mod one_process;
+pub mod output;
 pub mod part;
 pub mod plant;
 pub mod plant_process;

@@ -1,33 +1,35 @@
 //! The log of a run: every state, command and truth, in one MCAP file with self-describing channels.
 //!
 //! Messages are ROS 2 CDR: the structs as they lie in memory behind a header of four bytes. All their fields are naturally aligned, so the
-//! two forms are the same, bit for bit; the schemas in this file say what the bytes are, and any MCAP tool reads them.
+//! two forms are the same, bit for bit; commands are packed to what they use ([`crate::log_command`]). The schemas in this file say what the
+//! bytes are, and any MCAP tool reads them.
 //!
 //! Beside them, in JSON, what makes viewers show the robot: [`crate::log_viewer`]. Scenario and robot are attached as files.
 //!
-//! The loop only puts records into a bounded queue. A thread of ordinary priority writes them; when it cannot keep up, records are
-//! dropped and counted in real time, and waited for in lockstep.
+//! The loop only copies records into a ring of memory that is there before the run ([`crate::log_queue`]). A thread of ordinary priority
+//! writes them ([`crate::log_file`]), so that a killed process loses what is younger than 50 ms. When the thread cannot keep up for seconds,
+//! records are refused and counted in real time, and waited for in lockstep. Messages are numbered by the loop: what is missing shows.
 
-use std::borrow::Cow;
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::BufWriter;
+use std::io;
 use std::path::Path;
-use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
 
 use bytemuck::bytes_of;
 use delmpc_messages::{Command, PlantState};
-use mcap::records::{MessageHeader, Metadata};
-use mcap::{Attachment, Compression, WriteOptions, Writer};
 
+use crate::log_command;
+use crate::log_file::LogFile;
+use crate::log_queue::{Head, Receiver, Sender, queue};
 use crate::log_viewer::{self, LogViewer};
 use crate::steering::Pull;
 use crate::truth::Truth;
 use crate::verdict::Failure;
 
-/// Records on their way to the file. A record has the size of a command, 17 kB.
-const QUEUE: usize = 1024;
+/// Room for records on their way to the file: some seconds of a large robot in real time, where nothing waits ...
+const REALTIME_RING: usize = 64 << 20;
+/// ... and enough to keep the writer busy where the loop waits.
+const LOCKSTEP_RING: usize = 2 << 20;
 /// Little-endian CDR, no options.
 const ENCAPSULATION: [u8; 4] = [0, 1, 0, 0];
 
@@ -51,85 +53,98 @@ pub struct LogHead {
     pub viewer: Option<LogViewer>,
 }
 
-#[allow(clippy::large_enum_variant, reason = "the loop must not allocate")]
-enum Record {
-    State(PlantState),
-    Command(Command),
-    Truth(Truth),
-    Pull(Pull),
+/// Kinds of records, in the order of their channels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    State,
+    Command,
+    Truth,
+    Pull,
 }
 
+const KINDS: usize = 4;
+
 /// The loop's end of the log.
+#[derive(Debug)]
 pub struct Log {
-    queue: Option<SyncSender<(u64, Record)>>,
-    writer: Option<JoinHandle<Result<(), mcap::McapError>>>,
+    sender: Option<Sender>,
+    writer: Option<JoinHandle<io::Result<()>>>,
     waits: bool,
+    packed: Vec<u8>,
+    /// Records of each kind so far.
+    numbers: [u32; KINDS],
     dropped: u64,
 }
 
 impl Log {
-    /// Opens the file and starts the writer. `waits`: when the queue is full, wait, do not drop.
+    /// Opens the file and starts the writer. `waits`: when the ring is full, wait, do not drop.
     ///
     /// Make it before raising the priority: the writer is an ordinary thread.
     ///
     /// # Errors
     /// When the file cannot be made.
     pub fn create(path: &Path, head: LogHead, waits: bool) -> Result<Self, Failure> {
-        let cannot = |error: &dyn std::fmt::Display| Failure::Fault(format!("{}: {error}", path.display()));
-        let file = File::create(path).map_err(|error| cannot(&error))?;
-        let mut writer = WriteOptions::new()
-            .compression(Some(Compression::Lz4))
-            .profile("ros2")
-            .create(BufWriter::new(file))
-            .map_err(|error| cannot(&error))?;
-        let metadata = Metadata { name: "run".to_owned(), metadata: head.about };
-        writer.write_metadata(&metadata).map_err(|error| cannot(&error))?;
-        for (name, media_type, content) in head.files {
-            // Without a date: logs of lockstep runs are the same bytes.
-            let (media_type, data) = (media_type.to_owned(), Cow::from(content));
-            let file = Attachment { log_time: 0, create_time: 0, name, media_type, data };
-            writer.attach(&file).map_err(|error| cannot(&error))?;
-        }
+        let cannot = |error: io::Error| Failure::Fault(format!("{}: {error}", path.display()));
+        let room = if waits { LOCKSTEP_RING } else { REALTIME_RING };
+        let (sender, receiver) = queue(room).map_err(|error| {
+            Failure::Fault(format!("no memory for the log, {} MB are needed: {error}", room >> 20))
+        })?;
+        let (file, channels) = begin(path, &head).map_err(cannot)?;
         let viewer = head.viewer;
-        let channels = Channels::add(&mut writer, viewer.is_some()).map_err(|error| cannot(&error))?;
-        let (queue, records) = sync_channel(QUEUE);
-        let writer = std::thread::spawn(move || write_all(writer, channels, viewer, &records));
-        Ok(Self { queue: Some(queue), writer: Some(writer), waits, dropped: 0 })
+        let writer = std::thread::Builder::new()
+            .name("log".to_owned())
+            .spawn(move || write_all(file, channels, viewer, receiver))
+            .map_err(cannot)?;
+        Ok(Self {
+            sender: Some(sender),
+            writer: Some(writer),
+            waits,
+            packed: Vec::with_capacity(log_command::MOST_BYTES),
+            numbers: [0; KINDS],
+            dropped: 0,
+        })
     }
 
     /// No log at all.
     pub fn none() -> Self {
-        Self { queue: None, writer: None, waits: false, dropped: 0 }
+        Self { sender: None, writer: None, waits: false, packed: Vec::new(), numbers: [0; KINDS], dropped: 0 }
     }
 
     /// Logs a state as sent, at a time of the plant's clock.
     pub fn state(&mut self, time_ns: u64, state: &PlantState) {
-        self.put(time_ns, || Record::State(*state));
+        self.put(time_ns, Kind::State, bytes_of(state));
     }
 
     /// Logs a command as received.
     pub fn command(&mut self, time_ns: u64, command: &Command) {
-        self.put(time_ns, || Record::Command(*command));
+        if self.sender.is_none() {
+            return;
+        }
+        let mut packed = std::mem::take(&mut self.packed);
+        packed.clear();
+        log_command::pack(command, &mut packed);
+        self.put(time_ns, Kind::Command, &packed);
+        self.packed = packed;
     }
 
     /// Logs the truth at the end of a step.
     pub fn truth(&mut self, truth: &Truth) {
-        self.put(truth.time_ns, || Record::Truth(*truth));
+        self.put(truth.time_ns, Kind::Truth, bytes_of(truth));
     }
 
     /// Logs a pull that begins, changes or ends.
     pub fn pull(&mut self, pull: &Pull) {
-        self.put(pull.time_ns, || Record::Pull(*pull));
+        self.put(pull.time_ns, Kind::Pull, bytes_of(pull));
     }
 
-    fn put(&mut self, time_ns: u64, record: impl FnOnce() -> Record) {
-        let Some(queue) = &self.queue else { return };
+    fn put(&mut self, time_ns: u64, kind: Kind, bytes: &[u8]) {
+        let Some(sender) = &mut self.sender else { return };
+        let number = &mut self.numbers[kind as usize];
+        let head = Head { time_ns, sequence: *number, kind: kind as u32, length: 0 };
+        *number = number.wrapping_add(1);
         let sent = match self.waits {
-            true => queue.send((time_ns, record())).is_ok(),
-            false => match queue.try_send((time_ns, record())) {
-                Err(TrySendError::Full(_) | TrySendError::Disconnected(_)) => false,
-                Ok(()) => true,
-            },
+            true => sender.send_waiting(head, &[bytes]),
+            false => sender.send(head, &[bytes]),
         };
         self.dropped += u64::from(!sent);
     }
@@ -139,11 +154,13 @@ impl Log {
     /// # Errors
     /// When the file could not be written.
     pub fn finish(mut self) -> Result<u64, Failure> {
-        self.queue = None; // the writer ends when it has written what is left
+        self.sender = None; // the writer ends when it has written what is left
         if let Some(writer) = self.writer.take() {
             let written =
                 writer.join().map_err(|_| Failure::Fault("the log's writer broke down".to_owned()))?;
-            written.map_err(|error| Failure::Fault(format!("the log cannot be written: {error}")))?;
+            written.map_err(|error| {
+                Failure::Fault(format!("the log cannot be written: {error}; it ends where that happened"))
+            })?;
         }
         Ok(self.dropped)
     }
@@ -151,78 +168,72 @@ impl Log {
 
 /// Channel numbers of the file.
 struct Channels {
-    state: u16,
-    command: u16,
-    truth: u16,
-    pull: u16,
+    /// By kind.
+    records: [u16; KINDS],
     viewer: BTreeMap<&'static str, u16>,
 }
 
-impl Channels {
-    fn add(writer: &mut Writer<BufWriter<File>>, with_viewer: bool) -> Result<Self, mcap::McapError> {
-        let mut viewer = BTreeMap::new();
-        if with_viewer {
-            let (transforms, scene) = (log_viewer::transforms_schema(), log_viewer::scene_schema());
-            for (topic, schema) in [
-                (log_viewer::TRANSFORMS, &transforms),
-                (log_viewer::ROBOT, &scene),
-                (log_viewer::FORCES, &scene),
-            ] {
-                let name = schema["title"].as_str().unwrap_or_default();
-                let schema = writer.add_schema(name, "jsonschema", schema.to_string().as_bytes())?;
-                viewer.insert(topic, writer.add_channel(schema, topic, "json", &BTreeMap::new())?);
-            }
-        }
-        let mut add = |topic: &str, name: &str, schema: &str| {
-            let schema = writer.add_schema(name, "ros2msg", schema.as_bytes())?;
-            writer.add_channel(schema, topic, "cdr", &BTreeMap::new())
-        };
-        Ok(Self {
-            state: add(STATE, "delmpc_msgs/msg/PlantState", &plant_state_schema())?,
-            command: add(COMMAND, "delmpc_msgs/msg/Command", &command_schema())?,
-            truth: add(TRUTH, "delmpc_msgs/msg/Truth", TRUTH_FIELDS)?,
-            pull: add(PULL, "delmpc_msgs/msg/Pull", PULL_FIELDS)?,
-            viewer,
-        })
+/// Makes the file with all that comes before the first record.
+fn begin(path: &Path, head: &LogHead) -> io::Result<(LogFile, Channels)> {
+    let mut file = LogFile::create(path)?;
+    file.metadata("run", &head.about)?;
+    for (name, media_type, content) in &head.files {
+        file.attach(name, media_type, content)?;
     }
+    let mut viewer = BTreeMap::new();
+    if head.viewer.is_some() {
+        let (transforms, scene) = (log_viewer::transforms_schema(), log_viewer::scene_schema());
+        for (topic, schema) in
+            [(log_viewer::TRANSFORMS, &transforms), (log_viewer::ROBOT, &scene), (log_viewer::FORCES, &scene)]
+        {
+            let name = schema["title"].as_str().unwrap_or_default();
+            let schema = file.schema(name, "jsonschema", &schema.to_string())?;
+            viewer.insert(topic, file.channel(schema, topic, "json")?);
+        }
+    }
+    let mut records = [0; KINDS];
+    for (kind, topic, name, fields) in [
+        (Kind::State, STATE, "PlantState", plant_state_schema()),
+        (Kind::Command, COMMAND, "Command", command_schema()),
+        (Kind::Truth, TRUTH, "Truth", TRUTH_FIELDS.to_owned()),
+        (Kind::Pull, PULL, "Pull", PULL_FIELDS.to_owned()),
+    ] {
+        let schema = file.schema(&format!("delmpc_msgs/msg/{name}"), "ros2msg", &fields)?;
+        records[kind as usize] = file.channel(schema, topic, "cdr")?;
+    }
+    Ok((file, Channels { records, viewer }))
 }
 
 fn write_all(
-    mut writer: Writer<BufWriter<File>>,
+    mut file: LogFile,
     channels: Channels,
     mut viewer: Option<LogViewer>,
-    records: &Receiver<(u64, Record)>,
-) -> Result<(), mcap::McapError> {
-    let mut sequences = BTreeMap::<u16, u32>::new();
-    let mut write = |channel_id: u16, time_ns: u64, bytes: &[u8]| {
-        let sequence = sequences.entry(channel_id).or_default();
-        let header =
-            MessageHeader { channel_id, sequence: *sequence, log_time: time_ns, publish_time: time_ns };
-        *sequence += 1;
-        writer.write_to_known_channel(&header, bytes)
-    };
-    let mut bytes = Vec::new();
-    for (time_ns, record) in records {
-        let (channel_id, content) = match &record {
-            Record::State(state) => (channels.state, bytes_of(state)),
-            Record::Command(command) => (channels.command, bytes_of(command)),
-            Record::Truth(truth) => (channels.truth, bytes_of(truth)),
-            Record::Pull(pull) => (channels.pull, bytes_of(pull)),
-        };
-        bytes.clear();
-        bytes.extend_from_slice(&ENCAPSULATION);
-        bytes.extend_from_slice(content);
-        write(channel_id, time_ns, &bytes)?;
-        if let (Some(viewer), Record::Truth(truth)) = (&mut viewer, &record) {
-            for (topic, message) in viewer.messages(truth) {
-                if let Some(&channel_id) = channels.viewer.get(topic) {
-                    write(channel_id, time_ns, message.to_string().as_bytes())?;
+    mut records: Receiver,
+) -> io::Result<()> {
+    let mut shown = BTreeMap::<u16, u32>::new();
+    let mut content = Vec::with_capacity(log_command::MOST_BYTES);
+    while let Some(Head { time_ns, sequence, kind, .. }) = records.next(&mut content) {
+        let Some(&channel) = channels.records.get(kind as usize) else { continue };
+        file.message(channel, sequence, time_ns, &[&ENCAPSULATION, &content])?;
+        if kind != Kind::Truth as u32 {
+            continue;
+        }
+        if let (Some(viewer), Ok(truth)) = (&mut viewer, bytemuck::try_pod_read_unaligned(&content)) {
+            for (topic, message) in viewer.messages(&truth) {
+                if let Some(&channel) = channels.viewer.get(topic) {
+                    let number = shown.entry(channel).or_default();
+                    file.message(channel, *number, time_ns, &[message.to_string().as_bytes()])?;
+                    *number += 1;
                 }
             }
         }
     }
-    writer.finish()?;
-    Ok(())
+    file.finish()
+}
+
+/// The command in a record of the log; `None` when it is none.
+pub fn read_command(data: &[u8]) -> Option<Command> {
+    log_command::unpack(data.get(ENCAPSULATION.len()..)?)
 }
 
 /// The message in a record of the log; `None` when it has another size.
@@ -282,20 +293,21 @@ float64[3] gyro_bias
 float64[3] accelerometer_bias
 ";
 
+/// Lists have a number per joint.
 const SEGMENT_FIELDS: &str = "\
 uint64 begin_ns
-float64[32] torque
-float64[32] torque_lower
-float64[32] torque_upper
-float64[32] position_ref
-float64[32] velocity_ref
-float64[32] acceleration_ref
+float64[<=32] torque
+float64[<=32] torque_lower
+float64[<=32] torque_upper
+float64[<=32] position_ref
+float64[<=32] velocity_ref
+float64[<=32] acceleration_ref
 float64[3] imu_angle_ref
 float64[3] imu_rate_ref
 float64[3] imu_acceleration_ref
 ";
 
-/// The gain is the row-major 32 x 64 matrix, that of the inertial unit 32 x 6.
+/// As [`log_command`] packs it. The gain has a row per joint: first positions, then velocities; that of the inertial unit six numbers a row.
 const COMMAND_FIELDS: &str = "\
 delmpc_msgs/Header header
 uint64 state_sequence
@@ -308,14 +320,14 @@ uint32 fallback_level
 uint32 reason
 uint32 n_segments
 uint32 rate_samples
-delmpc_msgs/Segment[8] segments
-float64[2048] gain
-float64[192] imu_gain
+delmpc_msgs/Segment[<=8] segments
+float64[<=2048] gain
+float64[<=192] imu_gain
 float64[3] imu_rate_bias
 uint32[32] load_foot
 float64[8] full_load_n
-float64[32] unloaded_stiffness
-float64[32] unloaded_damping
+float64[<=32] unloaded_stiffness
+float64[<=32] unloaded_damping
 delmpc_msgs/CycleReport report
 delmpc_msgs/StateEstimate estimate
 ";
@@ -407,7 +419,10 @@ mod tests {
         for line in fields.lines() {
             let (kind, name) = line.split_once(' ').unwrap();
             let (kind, count) = match kind.split_once('[') {
-                Some((kind, count)) => (kind, count.trim_end_matches(']').parse().unwrap()),
+                // In memory there is always room for as many as there may be.
+                Some((kind, count)) => {
+                    (kind, count.trim_end_matches(']').trim_start_matches("<=").parse().unwrap())
+                }
                 None => (kind, 1),
             };
             let (size, alignment) = match kind {

@@ -1,11 +1,13 @@
 //! The command `delmpc`: parse, call, report how it ended.
 
 use std::alloc::System;
+use std::io::ErrorKind;
 use std::process::ExitCode;
 
 use clap::Parser;
 use delmpc::cli::{Cli, Command, RunArguments};
-use delmpc::verdict::exit_code;
+use delmpc::verdict::{Ended, Failure, exit_code};
+use delmpc_controller_process::stop::StopFlag;
 use stats_alloc::{INSTRUMENTED_SYSTEM, StatsAlloc};
 
 /// Counts allocations: a control cycle should make none of its own.
@@ -13,7 +15,11 @@ use stats_alloc::{INSTRUMENTED_SYSTEM, StatsAlloc};
 static ALLOCATOR: &StatsAlloc<System> = &INSTRUMENTED_SYSTEM;
 
 fn main() -> ExitCode {
-    let cli = Cli::parse();
+    StopFlag::outlive_file_limits();
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(usage) => return exit_code(say_usage(&usage)),
+    };
     let command = cli.command.unwrap_or(Command::Run(RunArguments { scenario: None, options: cli.options }));
     exit_code(match command {
         Command::Run(arguments) => delmpc::run::run(&arguments),
@@ -27,6 +33,18 @@ fn main() -> ExitCode {
         Command::TransportPeer(arguments) => delmpc::timing::transport::transport_peer(&arguments),
         Command::Report(arguments) => delmpc::report::report(&arguments),
     })
+}
+
+/// Help and version on standard output, what is wrong with the arguments on standard error.
+fn say_usage(usage: &clap::Error) -> Result<Ended, Failure> {
+    match usage.print() {
+        // A reader that has gone away has seen enough.
+        Err(error) if !usage.use_stderr() && error.kind() != ErrorKind::BrokenPipe => {
+            Err(Failure::Fault(format!("standard output cannot be written: {error}")))
+        }
+        _ if usage.use_stderr() => Ok(Ended::Misused),
+        _ => Ok(Ended::Well),
+    }
 }
 
 /// Heap allocations of this process so far.

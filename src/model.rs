@@ -18,8 +18,13 @@ use nalgebra::{DMatrix, DVector, Quaternion, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::drawing::drawing;
+use crate::input_file::read_answerable;
+use crate::output::{line, name_in_table, print, printable};
 use crate::stance::stances;
 use crate::verdict::{Ended, Failure};
+
+/// Largest file of `--at`, bytes.
+const MOST_QUESTION: u64 = 16 << 20;
 
 /// Arguments of `delmpc model`.
 #[derive(Debug, clap::Args)]
@@ -52,11 +57,14 @@ pub fn model(arguments: &ModelArguments) -> Result<Ended, Failure> {
             let robot = load_robot(arguments, base.as_deref(), question.gravity)?;
             let answer = answer(&robot, &question)
                 .map_err(|error| Failure::Input(format!("{}: {error}", file.display())))?;
-            println!("{}", serde_json::to_string(&answer).map_err(Failure::fault)?);
+            line(
+                in_numbers(&answer)
+                    .map_err(|error| Failure::Input(format!("{}: {error}", file.display())))?,
+            )?;
         }
         None => {
             let robot = load_robot(arguments, arguments.base.as_deref(), None)?;
-            print!("{}", table(&robot)?);
+            print(&printable(&table(&robot)?))?;
             if let Some(file) = &arguments.svg {
                 let svg = drawing(&robot).map_err(Failure::input)?;
                 std::fs::write(file, svg)
@@ -156,9 +164,45 @@ struct BasePoseAnswer {
 
 fn read_question(file: &Path) -> Result<Question, Failure> {
     let name = file.display();
-    let text = std::fs::read_to_string(file)
+    let text = read_answerable(file, MOST_QUESTION)
         .map_err(|error| Failure::Input(format!("{name}: cannot be read ({error}): give a JSON file")))?;
     serde_json::from_str(&text).map_err(|error| Failure::Input(format!("{name}: {error}")))
+}
+
+/// The answer to the text of a file of `--at`, as JSON; base and gravity are those of `robot`.
+///
+/// # Errors
+/// What is wrong with the question, in words.
+pub fn answer_to(robot: &RobotModel, text: &str) -> Result<String, String> {
+    let question: Question = serde_json::from_str(text).map_err(|error| error.to_string())?;
+    in_numbers(&answer(robot, &question)?)
+}
+
+/// An answer as JSON.
+///
+/// # Errors
+/// When something in it is not finite, which JSON cannot say.
+fn in_numbers(answer: &Answer) -> Result<String, String> {
+    let value = serde_json::to_value(answer).map_err(|error| error.to_string())?;
+    match not_a_number(&value) {
+        None => serde_json::to_string(answer).map_err(|error| error.to_string()),
+        Some(place) => Err(format!("`{place}` of the answer is not finite: some number given is too large")),
+    }
+}
+
+/// Where in a value there is nothing.
+fn not_a_number(value: &serde_json::Value) -> Option<String> {
+    match value {
+        serde_json::Value::Null => Some(String::new()),
+        serde_json::Value::Array(list) => list
+            .iter()
+            .enumerate()
+            .find_map(|(index, value)| not_a_number(value).map(|place| format!("[{index}]{place}"))),
+        serde_json::Value::Object(map) => {
+            map.iter().find_map(|(key, value)| not_a_number(value).map(|place| format!("{key}{place}")))
+        }
+        _ => None,
+    }
 }
 
 /// Loads a robot with the base of the command line.
@@ -423,12 +467,16 @@ fn table(robot: &RobotModel) -> Result<String, Failure> {
     }
 
     let branches = branches(tree);
-    let names: Vec<String> =
-        branches.iter().zip(&robot.body_names).map(|(branch, name)| format!("{branch}{name}")).collect();
+    let names: Vec<String> = branches
+        .iter()
+        .zip(&robot.body_names)
+        .map(|(branch, name)| format!("{branch}{}", name_in_table(name)))
+        .collect();
+    let joint_names: Vec<String> = robot.joint_names.iter().map(|name| name_in_table(name)).collect();
     let width = |names: &[String], least: usize| {
         names.iter().map(|name| name.chars().count()).max().unwrap_or(0).max(least)
     };
-    let (body_width, joint_width) = (width(&names, 4), width(&robot.joint_names, 5));
+    let (body_width, joint_width) = (width(&names, 4), width(&joint_names, 5));
     let mut row = |[body, joint, kind, mass, range, effort, speed, damping]: [&str; 8]| {
         let line = format!(
             "{body:body_width$}  {joint:joint_width$}  {kind:9}  {mass:>9}  {range:>20}  {effort:>9}  {speed:>9}  {damping:>8}"
@@ -457,16 +505,7 @@ fn table(robot: &RobotModel) -> Result<String, Failure> {
         };
         let bound = |value: f64| if value.is_finite() { format!("{value:.2}") } else { "-".to_owned() };
         let (effort, speed) = (bound(limit.effort), bound(limit.velocity));
-        row([
-            name,
-            &robot.joint_names[joint],
-            kind,
-            &mass,
-            &range,
-            &effort,
-            &speed,
-            &bound(robot.damping[joint]),
-        ]);
+        row([name, &joint_names[joint], kind, &mass, &range, &effort, &speed, &bound(robot.damping[joint])]);
     }
     let list = |names: Vec<&str>| if names.is_empty() { "none".to_owned() } else { names.join(", ") };
     let soles: Vec<&str> = robot.soles.iter().map(|sole| sole.name.as_str()).collect();

@@ -47,7 +47,7 @@ pub enum Simulated {
         /// What the plant has to say.
         plant: Box<PlantPart>,
         /// What the controller has to say.
-        figures: CycleFigures,
+        figures: Box<CycleFigures>,
     },
     /// A step could not be computed, or a link broke.
     Fault(String),
@@ -76,7 +76,7 @@ pub fn simulate(setup: &Setup, log: Log, stop: &StopFlag) -> Result<Simulated, F
         Ok(run) => {
             let mut plant = run.part;
             plant.log_records_dropped = run.log.finish()?;
-            let figures = answers.controller_loop.figures().clone();
+            let figures = Box::new(answers.controller_loop.figures().clone());
             Ok(Simulated::Ended { plant: Box::new(plant), figures })
         }
     }

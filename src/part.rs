@@ -1,7 +1,8 @@
 //! What `delmpc plant` and `delmpc controller` have in common.
 
-use std::io::Write;
 use std::path::Path;
+use std::thread::sleep;
+use std::time::Duration;
 
 use bytemuck::Pod;
 use delmpc_controller_process::awake::Awake;
@@ -9,14 +10,20 @@ use delmpc_controller_process::controller_loop::Ending;
 use delmpc_controller_process::machine::prepare;
 use delmpc_controller_process::membership::Order;
 use delmpc_controller_process::records::Records;
-use delmpc_messages::{JointSetHasher, Role};
+use delmpc_messages::Role;
 use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::{RunId, remove_leftovers};
 use rustix::process::{Pid, getppid};
 use serde::Serialize;
+use serde::de::DeserializeOwned;
 
 use crate::cli::PartArguments;
+use crate::colour::Colour;
+use crate::output::{line, print, say};
+use crate::run_folder::{CONTROLLER_PART, PLANT_PART, RunFolder};
 use crate::setup::Setup;
+use crate::summary::Summary;
+use crate::summary_table::summary_table;
 use crate::verdict::{Ended, Failure};
 
 /// The run a process belongs to: the named one, or one made from the scenario, so that two processes of the same scenario meet.
@@ -26,10 +33,7 @@ use crate::verdict::{Ended, Failure};
 pub fn run_id(arguments: &PartArguments, setup: &Setup) -> Result<RunId, Failure> {
     match &arguments.run_id {
         Some(text) => text.parse().map_err(|error| Failure::Input(format!("--run-id: {error}"))),
-        None => {
-            let scenario = setup.scenario.to_toml();
-            Ok(RunId(JointSetHasher::new().joint(&scenario).finish()))
-        }
+        None => RunId::of_text(&setup.scenario.to_toml()).map_err(Failure::fault),
     }
 }
 
@@ -65,6 +69,15 @@ pub fn prepare_machine(role: Role, scenario: &Scenario) -> Option<Awake> {
     awake
 }
 
+/// How long the other process may be silent before it counts as lost; nothing: as long as it lives.
+pub fn lost_after_s(scenario: &Scenario) -> Option<f64> {
+    (scenario.clock == Clock::Realtime).then_some(scenario.process.hang_s)
+}
+
+/// Times a process looks whether it is the last one, and tidies up.
+const STAND_IN_ATTEMPTS: u32 = 10;
+const STAND_IN_PAUSE: Duration = Duration::from_millis(20);
+
 /// Who supervises this process, as long as it lives.
 #[derive(Debug, Clone, Copy)]
 pub struct Supervisor(Option<Pid>);
@@ -79,14 +92,94 @@ impl Supervisor {
     /// the run is dropped; the last process to do so succeeds.
     pub fn stand_in(self, run: RunId) {
         if self.0.is_none() || getppid() != self.0 {
-            let _ = remove_leftovers(run);
+            // The other process may be ending too, and be seen to live still.
+            for _ in 0..STAND_IN_ATTEMPTS {
+                if remove_leftovers(run).is_ok() {
+                    break;
+                }
+                sleep(STAND_IN_PAUSE);
+            }
         }
     }
 }
 
-/// A line on standard error; that nobody listens is no reason to stop.
-pub fn say(text: &str) {
-    let _ = writeln!(std::io::stderr(), "{text}");
+/// The folder of the results of a process that is nobody's child, if it has one.
+#[derive(Debug)]
+pub struct PartFolder(Option<RunFolder>);
+
+impl PartFolder {
+    /// Makes or enters the folder.
+    ///
+    /// # Errors
+    /// As [`RunFolder::join`].
+    pub fn enter(arguments: &PartArguments, role: Role, setup: &Setup) -> Result<Self, Failure> {
+        match &arguments.out {
+            Some(path) if !arguments.supervised => Ok(Self(Some(RunFolder::join(path, role, setup)?))),
+            _ => Ok(Self(None)),
+        }
+    }
+
+    /// The process has left its part; the last one puts both together as `delmpc run` does: summary, report, table.
+    ///
+    /// # Errors
+    /// [`Failure::Fault`] when the summary cannot be written.
+    pub fn leave(self, setup: &Setup, ended: Ended) -> Result<Ended, Failure> {
+        match self.0.filter(RunFolder::is_left_by_the_last) {
+            None => Ok(ended),
+            Some(folder) => {
+                let interrupted = (ended == Ended::Interrupted).then(|| "interrupted".to_owned());
+                let summary = summarize(setup, &folder, interrupted)?;
+                let shown = match crate::report::write(folder.path()) {
+                    Ok(page) => page,
+                    Err(failure) => {
+                        say(&format!("warning: no report: {failure}"));
+                        folder.path().to_owned()
+                    }
+                };
+                let feet = setup.robot.soles.len();
+                let colour = Colour::of(&std::io::stdout());
+                print(&summary_table(&summary, &setup.scenario, feet, colour))?;
+                line(shown.display())?;
+                match (ended, summary.success) {
+                    (Ended::Well, false) => Ok(Ended::CriterionMissed),
+                    _ => Ok(ended),
+                }
+            }
+        }
+    }
+}
+
+/// Puts the parts that two processes left in a folder together, and writes `summary.json`. `fault`: why the run broke off, if it did.
+///
+/// # Errors
+/// [`Failure::Fault`] when the summary cannot be written.
+pub fn summarize(setup: &Setup, folder: &RunFolder, fault: Option<String>) -> Result<Summary, Failure> {
+    let (mut plant, mut controller, mut fault) = (None, None, fault);
+    match (take_part(&folder.file(PLANT_PART)), take_part(&folder.file(CONTROLLER_PART))) {
+        (Ok(plant_part), Ok(controller_part)) => (plant, controller) = (plant_part, controller_part),
+        (Err(error), _) | (_, Err(error)) => fault = fault.or(Some(error)),
+    }
+    if plant.is_none() || controller.is_none() {
+        fault = fault.or(Some("a process left no figures".to_owned()));
+    }
+    let summary = Summary::new(&setup.scenario, plant, controller, fault);
+    let written = summary.write(&folder.file("summary.json"));
+    written.map_err(|error| Failure::Fault(format!("summary.json: {error}")))?;
+    Ok(summary)
+}
+
+/// Reads a process's part of the results and removes the file; `None` when the process left none.
+fn take_part<T: DeserializeOwned>(file: &Path) -> Result<Option<T>, String> {
+    let wrong = |error: &dyn std::fmt::Display| format!("{}: {error}", file.display());
+    match std::fs::read_to_string(file) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(wrong(&error)),
+        Ok(text) => {
+            let part = serde_json::from_str(&text).map_err(|error| wrong(&error))?;
+            std::fs::remove_file(file).map_err(|error| wrong(&error))?;
+            Ok(Some(part))
+        }
+    }
 }
 
 /// Leaves a part of the results in the run's folder, or prints it when there is none.
@@ -96,10 +189,7 @@ pub fn say(text: &str) {
 pub fn leave_part(folder: Option<&Path>, name: &str, part: &impl Serialize) -> Result<(), Failure> {
     let text = serde_json::to_string_pretty(part).map_err(Failure::fault)?;
     match folder {
-        None => {
-            println!("{text}");
-            Ok(())
-        }
+        None => line(&text),
         Some(folder) => {
             let file = folder.join(name);
             // Whole or not at all: the supervisor may look at any time.

@@ -5,18 +5,20 @@ use std::io::BufReader;
 
 use delmpc_controller_process::membership::Membership;
 use delmpc_messages::{PlantState, Role};
-use delmpc_scenario::{Clock, Scenario};
+use delmpc_scenario::Clock;
 use delmpc_transport::{Channel, RunId};
 
 use crate::cli::PartArguments;
 use crate::faults::FaultyPlant;
 use crate::log::{Log, LogHead};
 use crate::log_viewer::LogViewer;
+use crate::output::say;
 use crate::part::{
-    Supervisor, ended, leave_part, leave_records, message_run_id, prepare_machine, run_id, say,
+    PartFolder, Supervisor, ended, leave_part, leave_records, lost_after_s, message_run_id, prepare_machine,
+    run_id,
 };
 use crate::plant_process::{PlantLoop, PlantRun};
-use crate::run_folder::{PLANT_PART, ROBOT_FILE, STEP_RECORDS};
+use crate::run_folder::{PLANT_PART, STEP_RECORDS, effective};
 use crate::setup::Setup;
 use crate::simulated_robot::SimulatedRobot;
 use crate::steering::Steering;
@@ -32,6 +34,7 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
     let scenario = &setup.scenario;
     let run = run_id(arguments, &setup)?;
     let mut robot = FaultyPlant::new(SimulatedRobot::new(&setup)?, scenario);
+    let part = PartFolder::enter(arguments, Role::Plant, &setup)?;
     let log = match &arguments.out {
         Some(folder) if !arguments.timing => {
             Log::create(&folder.join("log.mcap"), log_head(&setup, run), scenario.clock == Clock::Lockstep)?
@@ -42,7 +45,7 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
 
     let hash = setup.joint_set_hash();
     let mut membership =
-        Membership::join(run, hash, Role::Plant, arguments.supervised, scenario.process.hang_s)
+        Membership::join(run, hash, Role::Plant, arguments.supervised, lost_after_s(scenario))
             .map_err(Failure::fault)?;
     if !arguments.supervised {
         say(&format!("run {run}: the plant waits for a controller of the same scenario"));
@@ -61,36 +64,36 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
     if arguments.timing {
         plant_loop = plant_loop.recording();
     }
-    let PlantRun { ending, mut part, log, records } =
+    let PlantRun { ending, part: mut figures, log, records } =
         plant_loop.run(&mut robot, &mut membership).map_err(Failure::fault)?;
-    part.log_records_dropped = log.finish()?;
+    let logged = log.finish();
+    figures.log_records_dropped = *logged.as_ref().unwrap_or(&0);
+    if figures.log_records_dropped > 0 {
+        let lost = figures.log_records_dropped;
+        say(&format!(
+            "warning: {lost} records of the log were lost: the machine could not write them in time"
+        ));
+    }
     drop(membership);
     supervisor.stand_in(run);
     let folder = arguments.out.as_deref();
     leave_records(folder, STEP_RECORDS, &records)?;
-    leave_part(folder, PLANT_PART, &part)?;
-    ended(ending, "controller")
+    leave_part(folder, PLANT_PART, &figures)?;
+    logged?;
+    part.leave(&setup, ended(ending, "controller")?)
 }
 
 /// What the log says about its run. In lockstep only what is the same in every run of the seed.
 pub fn log_head(setup: &Setup, run: RunId) -> LogHead {
     let mut files = setup.robot_files();
-    files.insert(
-        0,
-        ("scenario.toml".to_owned(), "application/toml", effective_scenario(setup).to_toml().into_bytes()),
-    );
-    LogHead { about: about(setup, run), files, viewer: Some(LogViewer::new(setup)) }
+    files
+        .insert(0, ("scenario.toml".to_owned(), "application/toml", effective(setup).to_toml().into_bytes()));
+    LogHead { about: about(setup, Some(run)), files, viewer: Some(LogViewer::new(setup)) }
 }
 
-/// The scenario as it is in the run's folder.
-fn effective_scenario(setup: &Setup) -> Scenario {
-    let mut scenario = setup.scenario.clone();
-    scenario.robot.urdf = ROBOT_FILE.to_owned();
-    scenario
-}
-
-fn about(setup: &Setup, run: RunId) -> BTreeMap<String, String> {
-    let scenario = effective_scenario(setup);
+/// What identifies a run; in real time, if `run` is given, also what is of this one only.
+pub fn about(setup: &Setup, run: Option<RunId>) -> BTreeMap<String, String> {
+    let scenario = effective(setup);
     let mut about = BTreeMap::from([
         ("program".to_owned(), concat!("delmpc ", env!("CARGO_PKG_VERSION")).to_owned()),
         ("scenario".to_owned(), scenario.name.clone()),
@@ -101,7 +104,7 @@ fn about(setup: &Setup, run: RunId) -> BTreeMap<String, String> {
         ("model_hash".to_owned(), format!("{:016x}", setup.model_hash())),
         ("git_revision".to_owned(), env!("DELMPC_GIT_REVISION").to_owned()),
     ]);
-    if scenario.clock == Clock::Realtime {
+    if let Some(run) = run.filter(|_| scenario.clock == Clock::Realtime) {
         about.insert("run".to_owned(), run.to_string());
         about.insert("plant_pid".to_owned(), std::process::id().to_string());
     }

@@ -18,7 +18,7 @@ use std::time::Duration;
 
 use delmpc_controller_process::clock::{monotonic_ns, sleep_until};
 use delmpc_controller_process::controller_loop::Ending;
-use delmpc_controller_process::figures::percentile;
+use delmpc_controller_process::durations::Durations;
 use delmpc_controller_process::membership::{Attendance, Order};
 use delmpc_controller_process::records::{Records, StepRecord};
 use delmpc_controller_process::usage::Usage;
@@ -63,24 +63,44 @@ pub trait Plant {
     fn truth(&mut self, truth: &mut Truth);
 }
 
+/// Periods beyond the scenario's delays that a command may lie ahead: a plan prepared for a later tick, a tick that was missed.
+const MOST_PERIODS_AHEAD: f64 = 10.0;
+
 /// Commands whose time has not come.
 #[derive(Debug)]
 pub struct CommandQueue {
     waiting: VecDeque<Command>,
+    /// A command that begins later than this after it came is of no controller of ours (ns).
+    longest_lead_ns: u64,
 }
 
 impl CommandQueue {
     /// For a scenario.
     pub fn new(scenario: &Scenario) -> Self {
-        Self { waiting: VecDeque::with_capacity(scenario.controller.delay_cycles as usize + 4) }
+        let (controller, sensors) = (&scenario.controller, &scenario.sensors);
+        let periods = f64::from(controller.delay_cycles) + MOST_PERIODS_AHEAD;
+        let lead_s = periods / controller.mpc_rate_hz
+            + sensors.delay_s
+            + scenario.plant.actuator_delay_s
+            + controller.max_state_age_s;
+        Self {
+            waiting: VecDeque::with_capacity(controller.delay_cycles as usize + 4),
+            longest_lead_ns: (lead_s * 1e9).round() as u64,
+        }
     }
 
-    /// Takes a command in; a full queue gives up its oldest one.
-    pub fn push(&mut self, command: &Command) {
+    /// Takes a command in that came at `now_ns`; a full queue gives up its oldest one. `false`: it is of another run, or lies too far
+    /// ahead, and is refused: it would keep out those that come after it.
+    pub fn push(&mut self, command: &Command, run_id: u64, now_ns: u64) -> bool {
+        let ahead_ns = command.valid_from_ns.saturating_sub(now_ns);
+        if command.header.validate_run::<Command>(run_id).is_err() || ahead_ns > self.longest_lead_ns {
+            return false;
+        }
         if self.waiting.len() == self.waiting.capacity() {
             self.waiting.pop_front();
         }
         self.waiting.push_back(*command);
+        true
     }
 
     /// Gives the plant the commands whose time has come; says how many it refused.
@@ -149,8 +169,8 @@ pub struct PlantRun {
 /// What the wall clock said.
 #[derive(Debug, Default)]
 struct Timing {
-    steps_ns: Vec<u64>,
-    ages_ns: Vec<u64>,
+    steps: Durations,
+    ages: Durations,
     pauses: u64,
     begin_ns: u64,
     end_ns: u64,
@@ -159,8 +179,6 @@ struct Timing {
 impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
     /// A loop for a scenario. `blank` is a state with run, joint set and joint count filled in.
     pub fn new(scenario: &'a Scenario, states: P, commands: S, blank: &PlantState, log: Log) -> Self {
-        let realtime = scenario.clock == Clock::Realtime;
-        let room = if realtime { scenario.steps() as usize + 1 } else { 0 };
         let step_ns = (scenario.plant.step_s * 1e9).round() as u64;
         Self {
             scenario,
@@ -176,11 +194,7 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
             step_ns,
             time_ns: 0,
             start_ns: 0,
-            timing: Timing {
-                steps_ns: Vec::with_capacity(room),
-                ages_ns: Vec::with_capacity(room),
-                ..Timing::default()
-            },
+            timing: Timing { steps: Durations::new(), ages: Durations::new(), ..Timing::default() },
             commands_refused: 0,
             watchdog_level_max: 0,
             records: Records::none(),
@@ -292,7 +306,7 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
             let begin_ns = monotonic_ns();
             let goes_on = self.step(plant)?;
             let end_ns = monotonic_ns();
-            self.timing.steps_ns.push(end_ns - begin_ns);
+            self.timing.steps.add(end_ns - begin_ns);
             self.timing.end_ns = end_ns;
             if goes_on {
                 self.send_state(plant, 0)?;
@@ -370,28 +384,33 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
             if order.ends() {
                 return Ok(Some(order));
             }
+            if membership.peer_is_done() {
+                // What it sent before its end is there by now.
+                return Ok((self.receive()? != Some(sequence)).then_some(Order::PeerLost));
+            }
             self.states.serve_newcomers()?;
             sleep(PAUSE);
         }
     }
 
-    /// Takes the latest command into the queue; says which state it answers.
+    /// Takes the latest command into the queue; says which state it answers. One that is refused answers nothing.
     fn receive(&mut self) -> Result<Option<u64>, PlantFault> {
         let Some(command) = self.commands.receive_latest()? else {
             return Ok(None);
         };
-        self.queue.push(command);
+        self.log.command(self.time_ns, command);
+        if !self.queue.push(command, self.state.header.run_id, self.time_ns) {
+            self.commands_refused += 1;
+            return Ok(None);
+        }
         let realtime = self.scenario.clock == Clock::Realtime;
         if realtime && command.state_sequence > 1 {
-            let measured_ns = self.start_ns + command.state_time_ns;
+            let measured_ns = self.start_ns.saturating_add(command.state_time_ns);
             let age_ns = monotonic_ns().saturating_sub(measured_ns);
             self.arrival = (command.header.sent_at_ns, age_ns);
-            if self.timing.ages_ns.len() < self.timing.ages_ns.capacity() {
-                self.timing.ages_ns.push(age_ns);
-            }
+            self.timing.ages.add(age_ns);
         }
         self.metrics.observe_estimate(command);
-        self.log.command(self.time_ns, command);
         Ok(Some(command.state_sequence))
     }
 
@@ -462,7 +481,9 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
     ) -> Result<(), PlantFault> {
         self.send_state(plant, status::FINISHED)?;
         let begin_ns = monotonic_ns();
-        while !membership.peer_is_done() && monotonic_ns() < begin_ns + FAREWELL_NS {
+        // In lockstep nothing is decided by the wall clock: whoever is gone or wants the end says so.
+        let lockstep = self.scenario.clock == Clock::Lockstep;
+        while !membership.peer_is_done() && (lockstep || monotonic_ns() < begin_ns + FAREWELL_NS) {
             if membership.attend()?.ends() {
                 break;
             }
@@ -473,24 +494,63 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
         Ok(())
     }
 
-    fn part(&mut self) -> PlantPart {
-        let timing = &mut self.timing;
-        timing.steps_ns.sort_unstable();
-        timing.ages_ns.sort_unstable();
-        let at = |sorted: &[u64], part| percentile(sorted, part).map(|ns| ns as f64 * 1e-9);
+    fn part(&self) -> PlantPart {
+        let timing = &self.timing;
         let realtime = self.scenario.clock == Clock::Realtime;
         let wall_s = timing.end_ns.saturating_sub(timing.begin_ns) as f64 * 1e-9;
         let simulated_s = self.time_ns as f64 * 1e-9;
         PlantPart {
             robot: self.metrics.figures(),
-            state_to_command_age_p50_s: at(&timing.ages_ns, 0.5),
-            state_to_command_age_p999_s: at(&timing.ages_ns, 0.999),
-            plant_step_p50_s: at(&timing.steps_ns, 0.5),
+            state_to_command_age_p50_s: timing.ages.percentile_s(0.5),
+            state_to_command_age_p999_s: timing.ages.percentile_s(0.999),
+            plant_step_p50_s: timing.steps.percentile_s(0.5),
             plant_real_time_factor: (wall_s > 0.0).then(|| simulated_s / wall_s),
             plant_pauses: realtime.then_some(timing.pauses),
             log_records_dropped: 0,
             commands_refused: self.commands_refused,
             watchdog_level_max: self.watchdog_level_max,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Takes everything.
+    #[derive(Default)]
+    struct Taken(Vec<u64>);
+
+    impl Plant for Taken {
+        fn accept(&mut self, command: &Command) -> bool {
+            self.0.push(command.header.sequence);
+            true
+        }
+        fn step(&mut self) -> Result<(), String> {
+            Ok(())
+        }
+        fn pull(&mut self, _pull: &Pull) {}
+        fn measure(&mut self, _state: &mut PlantState) {}
+        fn truth(&mut self, _truth: &mut Truth) {}
+    }
+
+    #[test]
+    fn commands_of_another_run_or_of_the_far_future_do_not_enter_the_queue_and_the_next_good_one_acts() {
+        let mut queue = CommandQueue::new(&Scenario::default());
+        let command = |run, sequence, valid_from_ns| {
+            let mut command = Command::new(run, 2, 3);
+            command.header.sequence = sequence;
+            (command.valid_from_ns, command.valid_until_ns) = (valid_from_ns, valid_from_ns);
+            command
+        };
+        let now_ns = 1_000_000_000;
+        assert!(!queue.push(&command(8, 1, now_ns), 7, now_ns));
+        for far_ns in [u64::MAX, now_ns + 5_000_000_000, 1 << 62] {
+            assert!(!queue.push(&command(7, 2, far_ns), 7, now_ns), "{far_ns}");
+        }
+        assert!(queue.push(&command(7, 3, now_ns), 7, now_ns));
+        let mut plant = Taken::default();
+        assert_eq!(queue.hand_over(&mut plant, now_ns), 0);
+        assert_eq!(plant.0, [3]);
     }
 }

@@ -28,6 +28,8 @@ use serde::Serialize;
 
 use crate::log::Log;
 use crate::one_process::{Simulated, simulate};
+use crate::output::{line, print};
+use crate::run_folder::claim_or;
 use crate::setup::{Setup, scenario_file};
 use crate::summary::Summary;
 use crate::verdict::{Ended, Failure};
@@ -116,27 +118,25 @@ pub struct Limit {
 pub fn push_map(arguments: &PushMapArguments) -> Result<Ended, Failure> {
     let setup = trial_setup(arguments)?;
     let searches = searches(arguments, &setup)?;
+    let (folder, _lock) = claim_or(arguments.out.as_deref(), "runs/push-map")?;
     let stop = StopFlag::on_signals().map_err(Failure::fault)?;
     let found = search_all(arguments, &setup, &searches, &stop)?;
     if stop.is_set() {
         return Ok(Ended::Interrupted);
     }
     let limits = gather(&setup, &searches, &found);
-    let folder = arguments.out.clone().unwrap_or_else(|| PathBuf::from("runs/push-map"));
     let write = |name: &str, text: &str| {
         let file = folder.join(name);
         std::fs::write(&file, text).map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))
     };
-    std::fs::create_dir_all(&folder)
-        .map_err(|error| Failure::Input(format!("--out {}: {error}", folder.display())))?;
     let json = serde_json::to_string_pretty(&limits).map_err(Failure::fault)?;
     write("push_map.json", &json)?;
     write("push_map.svg", &polar_plot(&limits))?;
     if arguments.json {
-        println!("{json}");
+        line(&json)?;
     } else {
-        print!("{}", table(&limits));
-        println!("{}", folder.display());
+        print(&table(&limits))?;
+        line(folder.display())?;
     }
     Ok(Ended::Well)
 }

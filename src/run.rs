@@ -6,17 +6,19 @@ use std::path::Path;
 use delmpc_controller_process::stop::StopFlag;
 use delmpc_scenario::Clock;
 use delmpc_transport::remove_dead_runs;
-use serde::de::DeserializeOwned;
 
 use crate::cli::{RunArguments, RunOptions};
 use crate::colour::Colour;
 use crate::one_process::run_in_one_process;
-use crate::run_folder::{CONTROLLER_PART, PLANT_PART, RunFolder};
+use crate::output::{line, print, say};
+use crate::part::summarize;
+use crate::robot_controller::RobotController;
+use crate::run_folder::RunFolder;
 use crate::setup::{Setup, scenario_file};
+use crate::simulated_robot::SimulatedRobot;
 use crate::status_line::StatusLine;
-use crate::summary::Summary;
 use crate::summary_table::summary_table;
-use crate::supervisor::{Course, Supervision, fresh_run};
+use crate::supervisor::{Course, Supervision, TIDY_UP, fresh_run};
 use crate::verdict::{Ended, Failure};
 use crate::view::View;
 
@@ -36,9 +38,14 @@ pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
     }
     let talkative = !options.quiet && !options.json;
     if !options.quiet {
-        for warning in scenario.warnings() {
-            eprintln!("warning: {warning}");
+        for warning in setup.notes.iter().cloned().chain(scenario.warnings()) {
+            say(&format!("warning: {warning}"));
         }
+    }
+    if !options.one_process {
+        // What either process would refuse is refused here, before anything is overwritten or started.
+        RobotController::new(&setup)?;
+        SimulatedRobot::new(&setup)?;
     }
     let folder = RunFolder::create(options.out.as_deref(), &scenario.name)?;
     folder.write_inputs(&setup)?;
@@ -50,23 +57,14 @@ pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
     } else {
         run_in_two_processes(&setup, &folder, &stop, options, &mut view)?
     };
-    let (mut plant, mut controller) = (None, None);
-    let mut fault = match course {
+    let fault = match course {
         Course::Finished => None,
         Course::Interrupted => Some("interrupted".to_owned()),
         Course::Fault(ref why) => Some(why.clone()),
     };
-    match (take_part(&folder.file(PLANT_PART)), take_part(&folder.file(CONTROLLER_PART))) {
-        (Ok(plant_part), Ok(controller_part)) => (plant, controller) = (plant_part, controller_part),
-        (Err(error), _) | (_, Err(error)) => fault = fault.or(Some(error)),
-    }
-    if plant.is_none() || controller.is_none() {
-        fault = fault.or(Some("a process left no figures".to_owned()));
-    }
-    let broke_off = fault.is_some();
-    let summary = Summary::new(scenario, plant, controller, fault);
-    let written = summary.write(&folder.file("summary.json"));
-    written.map_err(|error| Failure::Fault(format!("summary.json: {error}")))?;
+    let finished = fault.is_none();
+    let summary = summarize(&setup, &folder, fault)?;
+    let broke_off = !finished || summary.plant.is_none() || summary.controller.is_none();
     if let Some(view) = view {
         view.finish(summary.success, summary.failure.as_deref());
     }
@@ -76,23 +74,23 @@ pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
         match crate::report::write(folder.path()) {
             Ok(page) => report = Some(page),
             Err(failure) if options.quiet => drop(failure),
-            Err(failure) => eprintln!("warning: no report: {failure}"),
+            Err(failure) => say(&format!("warning: no report: {failure}")),
         }
     }
 
     if options.json {
-        println!("{}", summary.to_json());
+        line(summary.to_json())?;
     } else if talkative {
         let feet = setup.robot.soles.len();
-        print!("{}", summary_table(&summary, scenario, feet, Colour::of(&std::io::stdout())));
-        println!("{}", report.as_deref().unwrap_or(folder.path()).display());
+        print(&summary_table(&summary, scenario, feet, Colour::of(&std::io::stdout())))?;
+        line(report.as_deref().unwrap_or(folder.path()).display())?;
     }
     match (course, summary.failure) {
         (Course::Interrupted, _) => Ok(Ended::Interrupted),
         (_, Some(failure)) if broke_off => Err(Failure::Fault(failure)),
         (_, Some(failure)) => {
             if options.quiet && !options.json {
-                eprintln!("{failure}");
+                say(&failure);
             }
             Ok(Ended::CriterionMissed)
         }
@@ -108,8 +106,8 @@ fn run_in_two_processes(
     view: &mut Option<View>,
 ) -> Result<Course, Failure> {
     let talkative = !options.quiet && !options.json;
-    remove_dead_runs();
-    let run = fresh_run();
+    remove_dead_runs(TIDY_UP, || stop.is_set());
+    let run = fresh_run()?;
     if options.view {
         let opened = view.insert(View::new(setup, options.port)?);
         let _ = writeln!(std::io::stderr(), "open {} to begin", opened.address());
@@ -123,6 +121,7 @@ fn run_in_two_processes(
         steering: view.as_ref().map(View::pipe),
         show_messages: talkative,
         hang_s: setup.scenario.process.hang_s,
+        lockstep: setup.scenario.clock == Clock::Lockstep,
         restarts: 0,
         late: None,
     };
@@ -143,20 +142,6 @@ fn run_in_two_processes(
         let _ = write!(std::io::stderr(), "\r\x1b[K");
     }
     course
-}
-
-/// Reads a process's part of the results and removes the file; `None` when the process left none.
-fn take_part<T: DeserializeOwned>(file: &Path) -> Result<Option<T>, String> {
-    let wrong = |error: &dyn std::fmt::Display| format!("{}: {error}", file.display());
-    match std::fs::read_to_string(file) {
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
-        Err(error) => Err(wrong(&error)),
-        Ok(text) => {
-            let part = serde_json::from_str(&text).map_err(|error| wrong(&error))?;
-            std::fs::remove_file(file).map_err(|error| wrong(&error))?;
-            Ok(Some(part))
-        }
-    }
 }
 
 fn text(path: &Path) -> Result<String, Failure> {

@@ -8,13 +8,21 @@
 //! | `log.mcap` | what was measured, commanded and true |
 //! | `messages.txt` | what the processes said |
 //! | `report.html`, `plots/` | the run to look at, and its key plots as PNG |
+//! | `.delmpc` | says that the folder is one of a run; locked while somebody writes into it |
+//!
+//! A folder that is named has to be new, empty, or that of an earlier run: nothing else is overwritten. While a run writes into a folder, a
+//! second one is refused. Plant and controller started by themselves share one: the first prepares it, the last one puts the results
+//! together.
 
-use std::fs;
+use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::ErrorKind;
-use std::os::unix::fs::symlink;
+use std::os::unix::fs::{OpenOptionsExt, symlink};
 use std::path::{Path, PathBuf};
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::sync::Arc;
+use std::thread::sleep;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
+use delmpc_messages::Role;
 use delmpc_scenario::Scenario;
 
 use crate::setup::Setup;
@@ -23,6 +31,13 @@ use crate::verdict::Failure;
 /// Files of an earlier run that would be taken for results of this one.
 const RESULTS: [&str; 6] =
     ["summary.json", "log.mcap", "messages.txt", REPORT_FILE, PLANT_PART, CONTROLLER_PART];
+/// Says that a folder is ours, and is locked by who writes into it.
+const MARKER: &str = ".delmpc";
+/// How often and how long to wait for somebody who just prepares a folder.
+const LOCK_ATTEMPTS: u32 = 100;
+const LOCK_PAUSE: Duration = Duration::from_millis(20);
+/// Files named when a folder is refused.
+const MOST_NAMED: usize = 3;
 /// The robot.
 pub const ROBOT_FILE: &str = "robot.urdf";
 /// The run to look at.
@@ -42,35 +57,159 @@ pub const CLOCK_READINGS: &str = "readings.records";
 /// Times of every step, left by the plant process for the timing report.
 pub const STEP_RECORDS: &str = "steps.records";
 
-/// A run's folder.
+/// A run's folder, locked for us until the last copy is dropped.
 #[derive(Debug, Clone)]
 pub struct RunFolder {
     path: PathBuf,
+    /// Held for their locks: the folder's, and for a lone process that of its role.
+    locks: Arc<[File]>,
+}
+
+/// Claims a folder for results: makes it, and refuses one that holds other things than those of an earlier command of ours, or into which
+/// another one is writing.
+///
+/// # Errors
+/// [`Failure::Input`] when it cannot be had.
+pub fn claim(path: &Path) -> Result<File, Failure> {
+    lock(path, marked(path)?)
+}
+
+/// Claims a folder for results that was named, or else a usual one under `runs/`, which is ours whatever is in it.
+///
+/// # Errors
+/// [`Failure::Input`] when it cannot be had.
+pub fn claim_or(named: Option<&Path>, usual: &str) -> Result<(PathBuf, File), Failure> {
+    let path = named.unwrap_or(Path::new(usual)).to_owned();
+    if named.is_none() {
+        fs::create_dir_all(&path).map_err(|error| unusable(&path, &error))?;
+        let made = OpenOptions::new().append(true).create(true).open(path.join(MARKER));
+        made.map_err(|error| unusable(&path, &error))?;
+    }
+    let lock = claim(&path)?;
+    Ok((path, lock))
+}
+
+fn lock(path: &Path, marker: File) -> Result<File, Failure> {
+    match marker.try_lock() {
+        Ok(()) => Ok(marker),
+        Err(TryLockError::WouldBlock) => Err(busy(path)),
+        Err(TryLockError::Error(error)) => Err(unusable(path, &error)),
+    }
+}
+
+/// Makes a folder with a marker, unless it holds what is not ours.
+fn marked(path: &Path) -> Result<File, Failure> {
+    fs::create_dir_all(path).map_err(|error| unusable(path, &error))?;
+    let marker = path.join(MARKER);
+    if !marker.is_file() && !is_of_earlier_run(path) {
+        let entries = fs::read_dir(path).map_err(|error| unusable(path, &error))?;
+        let names = entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned());
+        let mut names: Vec<String> = names.filter(|name| name != MARKER).take(MOST_NAMED).collect();
+        names.sort();
+        if !names.is_empty() {
+            let names = names.join(", ");
+            return Err(Failure::Input(format!(
+                "--out {}: it holds files that are not of a run ({names}): name a new or an empty folder",
+                path.display()
+            )));
+        }
+    }
+    let nofollow = rustix::fs::OFlags::NOFOLLOW.bits() as i32;
+    let opened = OpenOptions::new()
+        .read(true)
+        .write(true)
+        .create(true)
+        .truncate(false)
+        .custom_flags(nofollow)
+        .open(&marker);
+    opened.map_err(|error| unusable(path, &error))
+}
+
+/// Runs of versions that left no marker left a log beside a scenario.
+fn is_of_earlier_run(path: &Path) -> bool {
+    let magic = fs::File::open(path.join("log.mcap")).and_then(|mut log| {
+        let mut magic = [0; mcap::MAGIC.len()];
+        std::io::Read::read_exact(&mut log, &mut magic).map(|()| magic)
+    });
+    magic.is_ok_and(|magic| magic == *mcap::MAGIC) && path.join("messages.txt").is_file()
+}
+
+fn busy(path: &Path) -> Failure {
+    Failure::Input(format!("--out {}: another run is writing into it: name another folder", path.display()))
+}
+
+fn unusable(path: &Path, error: &std::io::Error) -> Failure {
+    Failure::Input(format!("--out {}: {error}", path.display()))
 }
 
 impl RunFolder {
     /// Makes the folder: the named one, or a new one under `runs/`, to which `runs/latest` then points.
     ///
     /// # Errors
-    /// [`Failure::Input`] when it cannot be made.
+    /// [`Failure::Input`] when it cannot be made, holds files that are not of a run, or is being written to.
     #[allow(clippy::disallowed_methods, reason = "a name for people, by their clock")]
     pub fn create(named: Option<&Path>, scenario: &str) -> Result<Self, Failure> {
         match named {
             Some(path) => {
-                let cannot = |error| Failure::Input(format!("--out {}: {error}", path.display()));
-                fs::create_dir_all(path).map_err(cannot)?;
-                for file in RESULTS {
-                    match fs::remove_file(path.join(file)) {
-                        Err(error) if error.kind() != ErrorKind::NotFound => return Err(cannot(error)),
-                        _ => {}
-                    }
-                }
-                Ok(Self { path: path.to_owned() })
+                let lock = claim(path)?;
+                remove_results(path)?;
+                Ok(Self { path: path.to_owned(), locks: Arc::new([lock]) })
             }
             None => {
                 Self::create_new(Path::new("runs"), &format!("{scenario}-{}", time_stamp(SystemTime::now())))
             }
         }
+    }
+
+    /// Enters a folder that plant and controller share, each started by itself. The first one removes what an earlier run has left and
+    /// writes configuration and robot; the other one has to be of the same.
+    ///
+    /// # Errors
+    /// [`Failure::Input`] as for [`Self::create`], and when this role is taken or the folder is of another scenario.
+    pub fn join(path: &Path, role: Role, setup: &Setup) -> Result<Self, Failure> {
+        let marker = marked(path)?;
+        let own = path.join(format!("{MARKER}-{}", role.name()));
+        let own = OpenOptions::new().write(true).create(true).truncate(false).open(own);
+        let own = own.map_err(|error| unusable(path, &error))?;
+        if own.try_lock().is_err() {
+            let role = role.name();
+            return Err(Failure::Input(format!(
+                "--out {}: another {role} is writing into it",
+                path.display()
+            )));
+        }
+        let first = marker.try_lock().is_ok();
+        let folder = Self { path: path.to_owned(), locks: Arc::new([marker, own]) };
+        if first {
+            remove_results(path)?;
+            folder.write_inputs(setup)?;
+        }
+        let mut attempts = 0;
+        while let Err(error) = folder.locks[0].try_lock_shared() {
+            attempts += 1;
+            if attempts > LOCK_ATTEMPTS {
+                return Err(match error {
+                    TryLockError::WouldBlock => busy(path),
+                    TryLockError::Error(error) => unusable(path, &error),
+                });
+            }
+            sleep(LOCK_PAUSE);
+        }
+        let written = fs::read_to_string(folder.file("scenario.toml")).unwrap_or_default();
+        if written != effective(setup).to_toml() {
+            return Err(Failure::Input(format!(
+                "--out {}: a process of another scenario is writing into it: give both the same, --set included",
+                path.display()
+            )));
+        }
+        Ok(folder)
+    }
+
+    /// Leaves a folder that is shared; says whether we are the last one, and have it alone now.
+    pub fn is_left_by_the_last(&self) -> bool {
+        let marker = &self.locks[0];
+        // First given up, then asked for: of two that end together, one gets it.
+        marker.unlock().is_ok() && marker.try_lock().is_ok()
     }
 
     fn create_new(runs: &Path, name: &str) -> Result<Self, Failure> {
@@ -87,12 +226,14 @@ impl RunFolder {
                 Err(error) => return Err(cannot(error)),
             }
         }
+        let path = runs.join(&folder);
+        let lock = claim(&path)?;
         // Made aside and moved, so that the link always points to a run. That it cannot be made is no reason not to run.
         let aside = runs.join(format!(".latest-{folder}"));
         if symlink(&folder, &aside).is_ok() && fs::rename(&aside, runs.join("latest")).is_err() {
             let _ = fs::remove_file(&aside);
         }
-        Ok(Self { path: runs.join(folder) })
+        Ok(Self { path, locks: Arc::new([lock]) })
     }
 
     /// Its path.
@@ -111,9 +252,7 @@ impl RunFolder {
     /// [`Failure::Input`] when they cannot be written.
     pub fn write_inputs(&self, setup: &Setup) -> Result<(), Failure> {
         let cannot = |error| Failure::Input(format!("{}: {error}", self.path.display()));
-        let mut scenario: Scenario = setup.scenario.clone();
-        scenario.robot.urdf = ROBOT_FILE.to_owned();
-        fs::write(self.file("scenario.toml"), scenario.to_toml()).map_err(cannot)?;
+        fs::write(self.file("scenario.toml"), effective(setup).to_toml()).map_err(cannot)?;
         copy(&setup.urdf, &self.file(ROBOT_FILE)).map_err(cannot)?;
         let companion = setup.urdf.with_extension("toml");
         if companion.is_file() {
@@ -121,6 +260,24 @@ impl RunFolder {
         }
         Ok(())
     }
+}
+
+/// The scenario as it is in the run's folder.
+pub fn effective(setup: &Setup) -> Scenario {
+    let mut scenario = setup.scenario.clone();
+    scenario.robot.urdf = ROBOT_FILE.to_owned();
+    scenario
+}
+
+/// Removes what would be taken for results of the run that begins.
+fn remove_results(path: &Path) -> Result<(), Failure> {
+    for file in RESULTS {
+        match fs::remove_file(path.join(file)) {
+            Err(error) if error.kind() != ErrorKind::NotFound => return Err(unusable(path, &error)),
+            _ => {}
+        }
+    }
+    Ok(())
 }
 
 /// Copies content, not permissions; a file onto itself stays.
@@ -177,5 +334,27 @@ mod tests {
         assert_eq!((first.path(), second.path()), (runs.join("a-1").as_path(), runs.join("a-1-2").as_path()));
         assert_eq!(fs::read_link(runs.join("latest")).unwrap(), Path::new("a-1-2"));
         fs::remove_dir_all(&runs).unwrap();
+    }
+
+    #[test]
+    fn a_folder_of_the_user_s_is_refused_one_in_use_too_and_that_of_an_earlier_run_serves_again() {
+        let scratch = std::env::temp_dir().join(format!("delmpc-run-claim-{}", std::process::id()));
+        fs::create_dir_all(&scratch).unwrap();
+        fs::write(scratch.join("scenario.toml"), "mine").unwrap();
+        let refused = RunFolder::create(Some(&scratch), "a").unwrap_err().to_string();
+        assert!(refused.contains("scenario.toml") && refused.contains("not of a run"), "{refused}");
+        assert_eq!(fs::read_to_string(scratch.join("scenario.toml")).unwrap(), "mine");
+        assert_eq!(fs::read_dir(&scratch).unwrap().count(), 1);
+
+        let folder = scratch.join("run");
+        let first = RunFolder::create(Some(&folder), "a").unwrap();
+        fs::write(first.file("summary.json"), "{}").unwrap();
+        let refused = RunFolder::create(Some(&folder), "a").unwrap_err().to_string();
+        assert!(refused.contains("another run is writing"), "{refused}");
+        assert!(first.file("summary.json").exists());
+        drop(first);
+        let second = RunFolder::create(Some(&folder), "a").unwrap();
+        assert!(!second.file("summary.json").exists());
+        fs::remove_dir_all(&scratch).unwrap();
     }
 }

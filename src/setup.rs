@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use delmpc_controller_core::config::ControllerConfig;
 use delmpc_mechanics::prelude::RigidTransform;
 use delmpc_messages::{JointSetHasher, MAX_JOINTS, joint_set_hash};
 use delmpc_robots::{RobotModel, load};
@@ -15,6 +16,9 @@ pub const MAIN_SCENARIO: &str = "configs/scenarios/atlas_one_foot.toml";
 /// The scenario whose faults are tried when none is named.
 pub const FAULT_SCENARIO: &str = "configs/scenarios/atlas_faults.toml";
 
+/// Longest stage of a horizon (s), as the controller has it.
+const LONGEST_STAGE_S: f64 = 0.2;
+
 /// What a run is about.
 #[derive(Debug, Clone)]
 pub struct Setup {
@@ -24,6 +28,8 @@ pub struct Setup {
     pub robot: RobotModel,
     /// Where the robot was found.
     pub urdf: PathBuf,
+    /// What should be known of the overrides.
+    pub notes: Vec<String>,
 }
 
 impl Setup {
@@ -39,7 +45,8 @@ impl Setup {
         let scenario = document.scenario().map_err(Failure::input)?;
         let urdf = find_robot(file, &scenario.robot.urdf);
         let robot = load(&urdf).map_err(Failure::input)?;
-        let setup = Self { scenario, robot, urdf };
+        let notes = document.notes().to_vec();
+        let setup = Self { scenario, robot, urdf, notes };
         setup.check_names().map_err(|error| Failure::Input(format!("{}: {error}", file.display())))?;
         Ok(setup)
     }
@@ -115,6 +122,25 @@ impl Setup {
         self.robot.sole(&self.scenario.robot.stance).map_or("", |sole| sole.frame.as_str())
     }
 
+    /// Keys that fit alone may not fit together.
+    fn check_stages(&self) -> Result<(), String> {
+        let settings = &self.scenario.controller;
+        let (horizon_s, stages) = (settings.horizon_s, settings.stages);
+        let config = ControllerConfig {
+            stages: ControllerConfig::stages_for(horizon_s, stages, 1.0 / settings.mpc_rate_hz),
+            ..ControllerConfig::default()
+        };
+        let lengths = config.stage_lengths();
+        let longest_s = lengths.iter().copied().fold(0.0, f64::max);
+        if lengths.iter().all(|length| *length > 0.0) && longest_s <= LONGEST_STAGE_S {
+            return Ok(());
+        }
+        Err(format!(
+            "`controller.horizon_s` = {horizon_s} and `controller.stages` = {stages} do not fit together: the longest stage would last \
+             {longest_s:.3} s, allowed are {LONGEST_STAGE_S} s: give more stages or a shorter horizon"
+        ))
+    }
+
     /// Every name of the scenario that the robot must know.
     fn check_names(&self) -> Result<(), String> {
         let Self { scenario, robot, .. } = self;
@@ -123,12 +149,27 @@ impl Setup {
                 "`robot.urdf`: this robot is fixed to the world; a plant needs one that can fall".to_owned()
             );
         }
+        self.check_stages()?;
         let joints = robot.joint_names.len();
         if joints > MAX_JOINTS {
             return Err(format!("`robot.urdf`: {joints} joints, but a message has room for {MAX_JOINTS}"));
         }
         if let Some(why) = crate::stance::undriven(robot).into_iter().next() {
             return Err(format!("`robot.urdf`: {why}"));
+        }
+        for (limit, joint) in robot.limits.iter().zip(&robot.joint_names) {
+            if limit.lower >= limit.upper {
+                return Err(format!(
+                    "`robot.urdf`: the joint {joint} has no range ({} .. {}): make its type \"fixed\" where it is locked",
+                    limit.lower, limit.upper
+                ));
+            }
+            if limit.velocity <= 0.0 {
+                let velocity = limit.velocity;
+                return Err(format!(
+                    "`robot.urdf`: the joint {joint} has the velocity limit {velocity}: it has to be above 0, or not given"
+                ));
+            }
         }
         let soles = robot.soles.iter().map(|sole| sole.name.as_str());
         one_of("robot.stance", "sole", &scenario.robot.stance, soles)?;

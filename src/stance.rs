@@ -9,6 +9,7 @@ use delmpc_mechanics::prelude::RigidTransform;
 use delmpc_robots::{Posture, RobotModel, Sole};
 use nalgebra::Vector3;
 
+use crate::output::name_in_table;
 use crate::sole::cop_margin_m;
 
 /// A sole counts as on the ground up to this height of its frame (m) ...
@@ -56,8 +57,9 @@ pub fn stances(robot: &RobotModel) -> Result<(String, Vec<String>), ModelError> 
         return Ok((text, warnings));
     }
     let width = |names: Vec<usize>| names.into_iter().max().unwrap_or(0).max(7);
-    let first = width(robot.postures.iter().map(|posture| posture.name.chars().count()).collect());
-    let second = width(robot.soles.iter().map(|sole| sole.name.chars().count()).collect());
+    let first =
+        width(robot.postures.iter().map(|posture| name_in_table(&posture.name).chars().count()).collect());
+    let second = width(robot.soles.iter().map(|sole| name_in_table(&sole.name).chars().count()).collect());
     let _ = writeln!(
         text,
         "{:first$}  {:second$}  {:>10}  {:>9}  {:>22}  {:>10}  largest holding torque",
@@ -79,7 +81,8 @@ pub fn stances(robot: &RobotModel) -> Result<(String, Vec<String>), ModelError> 
             let _ = write!(
                 text,
                 "{:first$}  {:second$}  {height:>10}  {lean:>9}",
-                stance.posture, stance.sole.name
+                name_in_table(stance.posture),
+                name_in_table(&stance.sole.name)
             );
             if stance.stands() {
                 let [x, y]: [f64; 2] = stance.com_m.xy().map(|value| tidy(1e3 * value, 1)).into();

@@ -101,14 +101,18 @@ impl Steering {
         let start = Wish { paused: true, ..Wish::none() };
         let latest = Arc::new(Mutex::new(start));
         let heard = latest.clone();
-        std::thread::spawn(move || {
+        let listener = std::thread::Builder::new().spawn(move || {
             let wish = || heard.lock().unwrap_or_else(PoisonError::into_inner);
             for line in lines.lines().map_while(Result::ok) {
                 wish().hear(&line, bodies);
             }
             *wish() = Wish::none();
         });
-        Self { latest: Some(latest), seen: start }
+        match listener {
+            Ok(_) => Self { latest: Some(latest), seen: start },
+            // Nobody can be heard: the world goes on.
+            Err(_) => Self::none(),
+        }
     }
 
     /// The latest wish; while another one is just being written, the one before. Never waits.

@@ -190,13 +190,21 @@ fn missed_criterion(scenario: &Scenario, plant: &PlantPart) -> Option<String> {
         return Some(format!("the run ended after {} of {} steps", robot.steps, scenario.steps()));
     }
     let realtime = scenario.clock == Clock::Realtime;
+    if plant.log_records_dropped > 0 {
+        let lost = plant.log_records_dropped;
+        return Some(format!(
+            "the log has holes: {lost} records were lost, the machine could not write them in time"
+        ));
+    }
     let at_most = |key: &str, value: Option<f64>, most: f64| {
-        let value = value.filter(|value| value.is_nan() || *value > most)?;
-        Some(format!("{key} = {value:.4}, allowed is at most {}", plain(most)))
+        let value = value.filter(|value| !is_at_most(*value, most))?;
+        let (value, most) = apart(value, most);
+        Some(format!("{key} = {value}, allowed is at most {most}"))
     };
     let at_least = |key: &str, value: Option<f64>, least: f64| {
-        let value = value.filter(|value| value.is_nan() || *value < least)?;
-        Some(format!("{key} = {value:.4}, needed is at least {}", plain(least)))
+        let value = value.filter(|value| !is_at_least(*value, least))?;
+        let (value, least) = apart(value, least);
+        Some(format!("{key} = {value}, needed is at least {least}"))
     };
     at_most("hand_error_at_deadline_m", robot.hand_error_at_deadline_m, limit.hand_error_at_deadline_m)
         .or_else(|| {
@@ -219,13 +227,54 @@ fn missed_criterion(scenario: &Scenario, plant: &PlantPart) -> Option<String> {
         })
 }
 
-/// A limit as somebody would write it: no more digits than are compared.
-fn plain(limit: f64) -> String {
-    let text = format!("{limit:.4}");
-    text.trim_end_matches('0').trim_end_matches('.').to_owned()
+/// A figure this near to a bound of exactly 0 keeps it: half of the last digit that is shown.
+const NEARLY_ZERO: f64 = 5e-5;
+/// Round-off of a figure, relative to its bound.
+const ROUND_OFF: f64 = 1e-9;
+
+fn tolerance(bound: f64) -> f64 {
+    if bound == 0.0 { NEARLY_ZERO } else { ROUND_OFF * bound.abs() }
+}
+
+/// Whether a figure keeps an upper bound, round-off aside.
+pub fn is_at_most(value: f64, most: f64) -> bool {
+    value <= most + tolerance(most)
+}
+
+/// Whether a figure keeps a lower bound, round-off aside.
+pub fn is_at_least(value: f64, least: f64) -> bool {
+    value >= least - tolerance(least)
+}
+
+/// A figure and its bound as somebody would write them, with as many digits as it takes to tell them apart.
+fn apart(value: f64, bound: f64) -> (String, String) {
+    let texts = |digits: usize| {
+        let plain = format!("{bound:.digits$}");
+        (format!("{value:.digits$}"), plain.trim_end_matches('0').trim_end_matches('.').to_owned())
+    };
+    let differ = |(value, bound): &(String, String)| value.parse::<f64>().ok() != bound.parse::<f64>().ok();
+    (4..12).map(texts).find(differ).unwrap_or_else(|| texts(12))
 }
 
 fn unit(direction: [f64; 3]) -> [f64; 3] {
     let length = direction.iter().map(|x| x * x).sum::<f64>().sqrt();
     direction.map(|x| x / length)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bound_of_exactly_zero_is_kept_by_round_off_and_a_figure_that_breaks_a_bound_is_told_apart_from_it() {
+        assert!(is_at_least(-1e-5, 0.0) && is_at_most(1e-5, 0.0) && is_at_least(0.0, 0.0));
+        assert!(!is_at_least(-6e-5, 0.0) && !is_at_most(6e-5, 0.0));
+        assert!(is_at_most(0.02 + 1e-15, 0.02) && !is_at_most(0.02001, 0.02));
+        assert!(!is_at_most(f64::NAN, 1.0) && !is_at_least(f64::NAN, 0.0));
+        let pair = |value, bound| apart(value, bound);
+        assert_eq!(pair(-6e-5, 0.0), ("-0.0001".to_owned(), "0".to_owned()));
+        assert_eq!(pair(0.02001, 0.02), ("0.02001".to_owned(), "0.02".to_owned()));
+        assert_eq!(pair(1.5, 1.0), ("1.5000".to_owned(), "1".to_owned()));
+        assert_eq!(pair(f64::NAN, 1.0).0, "NaN");
+    }
 }

@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 use delmpc_scenario::Scenario;
 
 use crate::colour::Colour;
+use crate::output::printable;
 use crate::report::criteria::criteria;
 use crate::summary::Summary;
 
@@ -13,9 +14,9 @@ pub fn summary_table(summary: &Summary, scenario: &Scenario, feet: usize, colour
     let mut text = String::new();
     let verdict = match &summary.failure {
         None => colour.good("success"),
-        Some(failure) => format!("{} {failure}", colour.bad("FAILED:")),
+        Some(failure) => format!("{} {}", colour.bad("FAILED:"), printable(failure)),
     };
-    let _ = writeln!(text, "{} (seed {}): {verdict}", summary.scenario, summary.seed);
+    let _ = writeln!(text, "{} (seed {}): {verdict}", printable(&summary.scenario), summary.seed);
     // Of a process that left nothing there is nothing to say.
     if summary.plant.is_some() {
         for criterion in criteria(scenario, feet, &summary.to_json()) {

@@ -5,7 +5,8 @@
 //! | both say they are ready | lets the run begin |
 //! | the plant finishes | waits for the controller, then all is well |
 //! | the controller is killed, and may be restarted | starts another one, while the plant's watchdog holds the robot |
-//! | a process ends too early, or falls silent | says so, ends the other one: fault |
+//! | a process ends too early | says so and why, ends the other one: fault |
+//! | a process falls silent in real time, other than to write its log | says so, ends both: fault |
 //! | Ctrl-C, SIGTERM | ends both: interrupted |
 //!
 //! A process is asked to end by the supervisor's heartbeat and by SIGTERM, and killed if it does not. Afterwards nothing of the run is left
@@ -18,7 +19,7 @@ use std::path::PathBuf;
 use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{JoinHandle, sleep};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
 use delmpc_controller_process::clock::monotonic_ns;
 use delmpc_controller_process::presence::{Peer, Presence};
@@ -27,12 +28,21 @@ use delmpc_messages::{ProcessState, Role};
 use delmpc_transport::{RunId, RunNode, remove_leftovers};
 use rustix::process::{Pid, Signal, kill_process};
 
+use crate::output::printable;
 use crate::verdict::Failure;
 
 /// Time between two looks at the processes.
 const LOOK: Duration = Duration::from_millis(5);
 /// A process may take this long to load, connect and warm up (s). Far beyond a healthy start on a busy machine.
 const START_PATIENCE_S: f64 = 60.0;
+/// Looking for what earlier runs have left takes no longer than this.
+pub const TIDY_UP: Duration = Duration::from_secs(3);
+/// Unit of the times a process had on a core, as Linux counts them for everybody (s).
+const TICK_S: f64 = 0.01;
+/// Silence that is none: the time between two signs of life, and some more (s).
+const SILENCE_S: f64 = 0.05;
+/// A process that has announced its end may take this long to write what it has (s).
+const FINISH_PATIENCE_S: f64 = 300.0;
 /// A process that was asked to end is killed after this (s).
 const END_PATIENCE_S: f64 = 3.0;
 
@@ -56,6 +66,8 @@ pub struct Supervision {
     pub steering: Option<PlantPipe>,
     /// A process that is silent for this long has failed, s.
     pub hang_s: f64,
+    /// In lockstep the wall clock decides nothing: only a process that somebody has stopped, and that is silent for that long, has failed.
+    pub lockstep: bool,
     /// How often a controller that was killed is started again, within the same run.
     pub restarts: u32,
     /// A process that is started later than the other one, and by how much, s.
@@ -74,10 +86,11 @@ pub enum Course {
 }
 
 /// A run nobody else has.
-#[allow(clippy::disallowed_methods, reason = "two runs differ even if the clock jumps: by their supervisors")]
-pub fn fresh_run() -> RunId {
-    let time_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as u64);
-    RunId::from_seeds(time_ns, std::process::id())
+///
+/// # Errors
+/// When the operating system has no random numbers.
+pub fn fresh_run() -> Result<RunId, Failure> {
+    RunId::random().map_err(Failure::fault)
 }
 
 /// The numbers by which the operating system knows the processes, and how far they are.
@@ -98,6 +111,52 @@ struct Watched {
     peer: Peer,
     ended: Option<ExitStatus>,
     listener: Option<JoinHandle<()>>,
+    /// The line it said last.
+    said: Arc<Mutex<String>>,
+    /// Time it had on a core when it gave its last sign of life, s.
+    used_s: f64,
+}
+
+/// What the operating system knows of a process.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Activity {
+    /// Its state as one letter.
+    state: char,
+    /// Time it had on a core, s.
+    used_s: f64,
+}
+
+impl Activity {
+    fn of(pid: u32) -> Self {
+        let text = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
+        // Behind the name, which may hold anything.
+        let fields: Vec<&str> = text.rsplit(") ").next().unwrap_or_default().split(' ').collect();
+        let ticks = |index: usize| fields.get(index).and_then(|field| field.parse::<u64>().ok()).unwrap_or(0);
+        let state = fields.first().and_then(|field| field.chars().next()).unwrap_or('?');
+        Self { state, used_s: (ticks(11) + ticks(12)) as f64 * TICK_S }
+    }
+
+    /// Whether a silent process hangs, or is only kept from its core: then it is ready to run, or waits for a disk, and has not had much of
+    /// a core since its last sign of life.
+    fn hangs(&self, used_s: f64, hang_s: f64, lockstep: bool) -> bool {
+        match self.state {
+            'T' | 't' => true,
+            _ if lockstep => false,
+            'R' | 'D' => self.used_s - used_s > 0.5 * hang_s,
+            _ => true,
+        }
+    }
+}
+
+impl Watched {
+    /// What a process that has ended said last, if that was why.
+    fn last_words(&mut self) -> String {
+        if let Some(listener) = self.listener.take() {
+            let _ = listener.join();
+        }
+        let said = self.said.lock().unwrap_or_else(PoisonError::into_inner);
+        said.strip_prefix("delmpc: ").map_or(String::new(), |why| format!(": {why}"))
+    }
 }
 
 impl Supervision {
@@ -204,14 +263,26 @@ impl Supervision {
             .stderr(Stdio::piped())
             .spawn()
             .map_err(|error| Failure::Fault(format!("cannot start the {} process: {error}", role.name())))?;
+        let said = Arc::new(Mutex::new(String::new()));
+        let listener = child.stderr.take().map(|stream| {
+            let (messages, said, show) = (messages.clone(), said.clone(), self.show_messages);
+            std::thread::Builder::new().spawn(move || pass_on(role, stream, &messages, &said, show))
+        });
+        let listener = match listener.transpose() {
+            Ok(listener) => listener,
+            Err(error) => {
+                let _ = child.kill();
+                let _ = child.wait();
+                return Err(Failure::Fault(format!(
+                    "cannot start a thread for the {} process: {error}",
+                    role.name()
+                )));
+            }
+        };
         if let Some(pipe) = steering {
             *pipe.lock().unwrap_or_else(PoisonError::into_inner) = child.stdin.take();
         }
-        let listener = child.stderr.take().map(|stream| {
-            let (messages, show) = (messages.clone(), self.show_messages);
-            std::thread::spawn(move || pass_on(role, stream, &messages, show))
-        });
-        Ok(Watched { role, child, peer, ended: None, listener })
+        Ok(Watched { role, child, peer, ended: None, listener, said, used_s: 0.0 })
     }
 
     /// How the run stands; `None`: it goes on.
@@ -230,20 +301,30 @@ impl Supervision {
                     finished += 1;
                     continue;
                 }
-                let how = describe(status);
-                return Ok(Some(Course::Fault(format!("the {name} process (pid {pid}) {how}"))));
+                let (how, why) = (describe(status), process.last_words());
+                return Ok(Some(Course::Fault(format!("the {name} process (pid {pid}) {how}{why}"))));
             }
             let waited_s = (monotonic_ns() - begin_ns) as f64 * 1e-9;
             let silent_s = process.peer.silent_s();
             let state = process.peer.state();
             // Loading, connecting and warming up happen in one go.
             let starting = matches!(state, None | Some(ProcessState::Starting));
-            if starting && waited_s > START_PATIENCE_S {
+            if starting && waited_s > START_PATIENCE_S && !self.lockstep {
                 let message =
                     format!("the {name} process (pid {pid}) did not start within {START_PATIENCE_S} s");
                 return Ok(Some(Course::Fault(message)));
             }
-            if !starting && silent_s > self.hang_s {
+            // Who has announced the end gives no further sign: what is left is to write the log.
+            let ending = matches!(state, Some(ProcessState::Finished | ProcessState::Stopping));
+            let patience_s = if ending { self.hang_s.max(FINISH_PATIENCE_S) } else { self.hang_s };
+            let activity = Activity::of(pid);
+            if silent_s < SILENCE_S {
+                process.used_s = activity.used_s;
+            }
+            if !starting
+                && silent_s > patience_s
+                && activity.hangs(process.used_s, self.hang_s, self.lockstep)
+            {
                 let message = format!(
                     "the {name} process (pid {pid}) hangs: no sign of life for {silent_s:.1} s (limit process.hang_s = {})",
                     self.hang_s
@@ -301,9 +382,11 @@ fn say(messages: &Mutex<File>, line: &str) {
 }
 
 /// Keeps what a process says, line by line, and shows it.
-fn pass_on(role: Role, stream: impl Read, messages: &Mutex<File>, show: bool) {
+fn pass_on(role: Role, stream: impl Read, messages: &Mutex<File>, said: &Mutex<String>, show: bool) {
     for line in BufReader::new(stream).split(b'\n').map_while(Result::ok) {
         let line = String::from_utf8_lossy(&line);
+        let line = printable(&line);
+        *said.lock().unwrap_or_else(PoisonError::into_inner) = line.clone().into_owned();
         say(messages, &format!("{}: {line}", role.name()));
         if show {
             let mut stderr = std::io::stderr();
@@ -319,5 +402,20 @@ fn describe(status: ExitStatus) -> String {
         (Some(signal), _) => format!("ended by signal {signal}"),
         (None, Some(0)) => "ended before its work was done".to_owned(),
         (None, code) => format!("ended with exit status {}", code.unwrap_or_default()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_process_kept_from_its_core_does_not_hang_and_one_that_spins_sleeps_or_was_stopped_does() {
+        let hangs = |state, used_s, lockstep| Activity { state, used_s }.hangs(1.0, 2.0, lockstep);
+        assert!(!hangs('R', 1.5, false) && !hangs('D', 1.0, false));
+        assert!(hangs('R', 2.5, false) && hangs('S', 1.0, false) && hangs('T', 1.0, false));
+        assert!(!hangs('R', 9.0, true) && !hangs('S', 1.0, true) && hangs('T', 1.0, true));
+        let own = Activity::of(std::process::id());
+        assert!("RSD".contains(own.state) && own.used_s >= 0.0, "{own:?}");
     }
 }

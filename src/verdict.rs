@@ -1,8 +1,9 @@
 //! How a command ends.
 
 use std::fmt::Display;
-use std::io::Write;
 use std::process::ExitCode;
+
+use crate::output::say;
 
 /// Why a command did not do what it was asked. Success criteria that were missed are no failure of the command: see [`Ended`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -42,6 +43,8 @@ pub enum Ended {
     Well,
     /// A success criterion was missed. Exit status 1.
     CriterionMissed,
+    /// The arguments were wrong, and that was said. Exit status 2.
+    Misused,
     /// Somebody ended it (Ctrl-C). Exit status 130, as shells have it.
     Interrupted,
 }
@@ -52,6 +55,7 @@ impl Ended {
         match self {
             Self::Well => 0,
             Self::CriterionMissed => 1,
+            Self::Misused => 2,
             Self::Interrupted => 130,
         }
     }
@@ -62,8 +66,7 @@ pub fn exit_code(outcome: Result<Ended, Failure>) -> ExitCode {
     match outcome {
         Ok(ended) => ExitCode::from(ended.status()),
         Err(failure) => {
-            // A reader that is gone is no reason to panic.
-            let _ = writeln!(std::io::stderr(), "delmpc: {failure}");
+            say(&format!("delmpc: {failure}"));
             ExitCode::from(failure.status())
         }
     }

@@ -166,7 +166,7 @@ fn the_summary_is_what_the_log_says() {
             metrics.observe(&read_record::<Truth>(&message.data).unwrap());
             steps += 1;
         } else if message.channel.topic == delmpc::log::COMMAND {
-            metrics.observe_estimate(&read_record::<Command>(&message.data).unwrap());
+            metrics.observe_estimate(&delmpc::log::read_command(&message.data).unwrap());
             commands += 1;
         }
     }

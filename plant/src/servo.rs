@@ -106,6 +106,12 @@ impl WatchdogConfig {
     }
 }
 
+/// Most commands between two that are taken. A controller at 1 kHz counts as far in two hours and a half, and whatever sequence is in force,
+/// the next command of a controller that hears the plant is above it.
+pub const LARGEST_JUMP: u64 = 10_000_000;
+/// Longest time from the arrival of a command to the begin of its validity, ns.
+pub const LONGEST_LEAD_NS: u64 = 20_000_000_000;
+
 /// Why a command was not taken.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
@@ -120,6 +126,26 @@ pub enum CommandRefused {
         sequence: u64,
         /// The newest one taken.
         newest: u64,
+    },
+    /// Its sequence number is farther ahead than any controller can have counted.
+    #[error(
+        "command {sequence} came after command {newest}, more than {LARGEST_JUMP} ahead: a damaged number"
+    )]
+    JumpAhead {
+        /// Its sequence number.
+        sequence: u64,
+        /// The newest one taken.
+        newest: u64,
+    },
+    /// It is meant for a time that is too far away.
+    #[error("command {sequence} is valid from {valid_from_ns} ns on and came at {now_ns} ns: too far ahead")]
+    TooEarly {
+        /// Its sequence number.
+        sequence: u64,
+        /// Begin of its validity, ns.
+        valid_from_ns: u64,
+        /// Plant time, ns.
+        now_ns: u64,
     },
     /// It ran out before it came.
     #[error("command {sequence} was valid until {valid_until_ns} ns and came at {now_ns} ns")]
@@ -230,8 +256,17 @@ impl Servo {
     fn check(&self, command: &Command, now_ns: u64) -> Result<(), CommandRefused> {
         command.validate(self.joint_set_hash, self.joints)?;
         let sequence = command.header.sequence;
-        if sequence <= self.newest_sequence {
-            return Err(CommandRefused::OutOfOrder { sequence, newest: self.newest_sequence });
+        let (valid_from_ns, newest) = (command.valid_from_ns, self.newest_sequence);
+        // A command that waits for its time, whatever its number, does not keep out one that acts sooner.
+        let overtakes = self.pending.is_some_and(|at| valid_from_ns < self.slots[at].command.valid_from_ns);
+        if sequence <= self.applied_sequence() || (sequence <= newest && !overtakes) {
+            return Err(CommandRefused::OutOfOrder { sequence, newest });
+        }
+        if sequence.saturating_sub(newest) > LARGEST_JUMP {
+            return Err(CommandRefused::JumpAhead { sequence, newest });
+        }
+        if valid_from_ns.saturating_sub(now_ns) > LONGEST_LEAD_NS {
+            return Err(CommandRefused::TooEarly { sequence, valid_from_ns, now_ns });
         }
         let valid_until_ns = command.valid_until_ns;
         if valid_until_ns <= now_ns {
@@ -484,6 +519,44 @@ mod tests {
         }
         assert_eq!(servo.counts(), (1, 6));
         assert_eq!(torque(&mut servo, MS), [6.0, -2.0]);
+    }
+
+    #[test]
+    fn a_hostile_command_owns_nothing_and_the_next_good_one_acts() {
+        let hour = 3600 * 1000 * MS;
+        let hostile = |change: fn(&mut Command)| {
+            let mut hostile = command(2, 0, 5 * MS, 99.0);
+            change(&mut hostile);
+            hostile
+        };
+        let refused: [fn(&mut Command); 7] = [
+            |c| (c.header.sequence, c.valid_until_ns) = (u64::MAX, u64::MAX),
+            |c| c.header.sequence = u64::MAX,
+            |c| c.header.sequence = 1 << 40,
+            |c| c.valid_until_ns = u64::MAX,
+            |c| (c.valid_from_ns, c.valid_until_ns) = (u64::MAX, u64::MAX),
+            |c| c.valid_until_ns = 3600 * 1000 * MS,
+            |c| (c.valid_from_ns, c.valid_until_ns) = (3600 * 1000 * MS, 3600 * 1000 * MS + 5 * MS),
+        ];
+        for change in refused {
+            let mut servo = servo(false);
+            servo.accept(&command(1, 0, 5 * MS, 7.0), 0).unwrap();
+            assert!(servo.accept(&hostile(change), MS).is_err());
+            assert_eq!(torque(&mut servo, 2 * MS), [6.0, -2.0]);
+            servo.accept(&command(2, 0, 5 * MS, 3.0), 3 * MS).unwrap();
+            assert_eq!(torque(&mut servo, 3 * MS), [2.0, -2.0]);
+            assert_eq!(torque(&mut servo, hour), [0.0; 2]);
+        }
+        // Within what a controller might do: one that waits, with a number far ahead.
+        let mut servo = servo(false);
+        servo.accept(&command(1, 0, 5 * MS, 7.0), 0).unwrap();
+        servo.accept(&command(1_000_000, 9_000 * MS, 9_005 * MS, 99.0), MS).unwrap();
+        servo.accept(&command(2, 2 * MS, 7 * MS, 3.0), 2 * MS).unwrap();
+        assert_eq!(torque(&mut servo, 2 * MS), [2.0, -2.0]);
+        // One that acts at once: the state says which one it was, and the next one is above it.
+        servo.accept(&command(2_000_000, 0, 9_000 * MS, 99.0), 3 * MS).unwrap();
+        servo.accept(&command(servo.applied_sequence() + 1, 0, 9 * MS, 3.0), 4 * MS).unwrap();
+        assert_eq!(torque(&mut servo, 4 * MS), [2.0, -2.0]);
     }
 
     #[test]

@@ -4,6 +4,8 @@ use delmpc_scenario::{Clock, Scenario};
 use serde::Serialize;
 use serde_json::Value;
 
+use crate::summary::{is_at_least, is_at_most};
+
 /// One criterion.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Criterion {
@@ -49,7 +51,8 @@ pub fn criteria(scenario: &Scenario, feet: usize, summary: &Value) -> Vec<Criter
             met: touched.map(|touched| !touched),
         });
     }
-    let millimetres = |value: f64| format!("{:.1} mm", 1e3 * value);
+    // Not "-0.0": adding zero leaves no sign.
+    let millimetres = |value: f64| format!("{:.1} mm", (1e4 * value).round() / 10.0 + 0.0);
     let degrees = |value: f64| format!("{:.3}°", value.to_degrees());
     let percent = |value: f64| format!("{:.0} %", 1e2 * value);
     let seconds = |value: f64| format!("{value:.2} s");
@@ -60,7 +63,7 @@ pub fn criteria(scenario: &Scenario, feet: usize, summary: &Value) -> Vec<Criter
             name,
             value: value.map_or_else(none, show),
             limit: format!("{} {}", if most { "≤" } else { "≥" }, show(bound)),
-            met: value.map(|value| if most { value <= bound } else { value >= bound }),
+            met: value.map(|value| if most { is_at_most(value, bound) } else { is_at_least(value, bound) }),
         });
     };
     if scenario.reach.is_some() {
@@ -79,6 +82,14 @@ pub fn criteria(scenario: &Scenario, feet: usize, summary: &Value) -> Vec<Criter
     if scenario.clock == Clock::Realtime {
         let bound = limit.min_real_time_factor;
         compare("Simulated per wall time", "plant_real_time_factor", false, bound, &factor);
+    }
+    if let Some(lost) = number("log_records_dropped").filter(|lost| *lost > 0.0) {
+        list.push(Criterion {
+            name: "Log",
+            value: format!("{lost} lost"),
+            limit: "every record written".to_owned(),
+            met: Some(false),
+        });
     }
     list
 }

@@ -13,6 +13,7 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::output::{line, say};
 use crate::run_folder::{PLOTS_FOLDER, REPORT_FILE};
 use crate::setup::Setup;
 use crate::verdict::{Ended, Failure};
@@ -38,7 +39,7 @@ pub struct ReportArguments {
 /// # Errors
 /// [`Failure::Input`] for a folder that holds no run.
 pub fn report(arguments: &ReportArguments) -> Result<Ended, Failure> {
-    println!("{}", write(&arguments.run)?.display());
+    line(write(&arguments.run)?.display())?;
     Ok(Ended::Well)
 }
 
@@ -48,7 +49,11 @@ pub fn report(arguments: &ReportArguments) -> Result<Ended, Failure> {
 /// [`Failure::Input`] when the folder holds no run, [`Failure::Fault`] when the files cannot be written.
 pub fn write(folder: &Path) -> Result<PathBuf, Failure> {
     let setup = Setup::read(&folder.join("scenario.toml"), &[])?;
-    let recording = recording::Recording::read(&setup, &folder.join("log.mcap"))?;
+    let log = folder.join("log.mcap");
+    let recording = recording::Recording::read(&setup, &log)?;
+    if let Some(damage) = &recording.damage {
+        say(&format!("warning: {}: {damage}", log.display()));
+    }
     // A run that broke off early may have no summary; what happened until then can still be looked at.
     let summary = std::fs::read(folder.join("summary.json")).ok();
     let summary = summary.and_then(|bytes| serde_json::from_slice(&bytes).ok()).unwrap_or_default();

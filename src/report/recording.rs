@@ -1,17 +1,16 @@
 //! The log of a run as columns over time, at the rate of an animation.
 //!
 //! Frames are [`FRAME_S`] apart, or farther in long runs. What happens between two frames must not get lost in a plot: columns that have a
-//! limit also hold their extremes over the steps since the frame before.
+//! limit also hold their extremes over the steps since the frame before. The log is read piece by piece, and what is kept of it is bounded,
+//! whatever its length.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use delmpc_messages::Command;
-use mcap::MessageStream;
-use mcap::read::LinearReader;
-use mcap::records::Record;
 
-use crate::log::{COMMAND, TRUTH, read_record};
+use crate::log::{COMMAND, TRUTH, read_command, read_record};
+use crate::log_reader::{End, Item, LogReader};
 use crate::setup::Setup;
 use crate::sole::pressure_point;
 use crate::truth::Truth;
@@ -21,6 +20,8 @@ use crate::verdict::Failure;
 pub const FRAME_S: f64 = 0.01;
 /// Most frames; longer runs have fewer frames per second.
 const MAX_FRAMES: f64 = 4000.0;
+/// Most frames of a log that is longer than its scenario says.
+const MOST_ROWS: usize = 20_000;
 /// Most cycles; longer runs show the worst of each group.
 const MAX_CYCLES: usize = 6000;
 
@@ -78,46 +79,54 @@ impl Recording {
     /// [`Failure::Input`] when there is no log, or nothing in it.
     pub fn read(setup: &Setup, file: &Path) -> Result<Self, Failure> {
         let broken = |error: &dyn std::fmt::Display| Failure::Input(format!("{}: {error}", file.display()));
-        let log = std::fs::read(file).map_err(|error| broken(&error))?;
+        let other_version = || broken(&"a record has the wrong size: another version wrote this log");
         let mut frames = FrameBuilder::new(setup);
-        let mut cycles = Vec::new();
-        let mut damage = None;
-        for message in MessageStream::new(&log).map_err(|error| broken(&error))? {
-            let message = match message {
-                Ok(message) => message,
-                Err(error) => {
-                    damage = Some(error.to_string());
-                    break;
+        let mut cycles = Cycles::default();
+        let mut about = None;
+        let (mut missing_records, mut last_ns) = (0_u64, 0);
+        let end = LogReader::open(file)?.each(|item| {
+            match item {
+                Item::About(pairs) => {
+                    about.get_or_insert(pairs);
                 }
-            };
-            let other_version = || broken(&"a record has the wrong size: another version wrote this log");
-            match message.channel.topic.as_str() {
-                TRUTH => frames.observe(&read_record(&message.data).ok_or_else(other_version)?),
-                COMMAND => {
-                    let command: Command = read_record(&message.data).ok_or_else(other_version)?;
+                Item::Message { topic: TRUTH, missing, data, time_ns } => {
+                    if missing > 0 {
+                        missing_records += u64::from(missing);
+                        frames.leave_hole();
+                    }
+                    last_ns = time_ns;
+                    frames.observe(&read_record(data).ok_or_else(other_version)?);
+                }
+                Item::Message { topic: COMMAND, missing, data, .. } => {
+                    missing_records += u64::from(missing);
+                    let command = read_command(data).ok_or_else(other_version)?;
                     if command.header.sequence > 0 {
-                        cycles.push(Cycle::new(&command));
+                        cycles.add(Cycle::new(&command));
                     }
                 }
-                _ => {}
+                Item::Message { missing, .. } => missing_records += u64::from(missing),
             }
-        }
+            Ok(frames.rows() < MOST_ROWS)
+        })?;
         let (frame_s, frames) = frames.finish();
-        if frames["time"].rows() == 0 {
-            return Err(broken(&"the log holds no motion"));
+        let until_s = last_ns as f64 * 1e-9;
+        let mut damage = match end {
+            Some(End::Whole) => None,
+            Some(End::Cut(why)) => {
+                let duration_s = setup.scenario.duration_s;
+                Some(format!("the log is cut after {until_s:.3} s of {duration_s} s: {why}"))
+            }
+            None => Some(format!("the log is longer than its scenario; it is drawn up to {until_s:.3} s")),
+        };
+        if missing_records > 0 {
+            let hole = format!("the log has holes: {missing_records} records are missing");
+            damage = Some(damage.map_or_else(|| hole.clone(), |cut| format!("{cut}; {hole}")));
         }
-        Ok(Self { about: about(&log), frame_s, frames, cycles: cycle_table(&cycles), damage })
+        if frames["time"].rows() == 0 {
+            return Err(broken(&damage.as_deref().unwrap_or("the log holds no motion")));
+        }
+        Ok(Self { about: about.unwrap_or_default(), frame_s, frames, cycles: cycles.table(), damage })
     }
-}
-
-/// What the log says about its run: the first record of metadata.
-fn about(log: &[u8]) -> BTreeMap<String, String> {
-    let records = LinearReader::new(log).into_iter().flatten().map_while(Result::ok);
-    let mut metadata = records.filter_map(|record| match record {
-        Record::Metadata(metadata) => Some(metadata.metadata),
-        _ => None,
-    });
-    metadata.next().unwrap_or_default()
 }
 
 /// Collects frames from the truth of every step.
@@ -217,6 +226,37 @@ impl FrameBuilder {
     pub fn put(&mut self, truth: &Truth) {
         self.note(truth);
         self.put_frame(truth);
+    }
+
+    /// Says that steps are missing: an empty frame, at which every line breaks.
+    fn leave_hole(&mut self) {
+        let Some(last) = self.last.take() else {
+            return self.put_nothing();
+        };
+        self.put_frame(&last);
+        self.put_nothing();
+    }
+
+    fn put_nothing(&mut self) {
+        let rows = self.rows();
+        if rows == 0 {
+            return;
+        }
+        for (name, column) in &mut self.table {
+            // The pose stays: a robot has one.
+            if ["time", "base", "position", "status", "watchdog", "feet"].contains(name) {
+                let last = column.values[(rows - 1) * column.width..rows * column.width].to_vec();
+                column.values.extend(last);
+            } else {
+                column.values.extend(std::iter::repeat_n(f32::NAN, column.width));
+            }
+        }
+        self.since = Extremes::none(self.joints);
+    }
+
+    /// Frames so far.
+    fn rows(&self) -> usize {
+        self.table.get("time").map_or(0, Column::rows)
     }
 
     /// The frames so far; later ones begin anew.
@@ -342,28 +382,72 @@ impl Cycle {
     }
 }
 
-/// One cycle as columns.
-pub fn cycle_table_of(command: &Command) -> Table {
-    cycle_table(&[Cycle::new(command)])
+/// Cycles, of many the largest values of each group, at the time of its first one.
+#[derive(Default)]
+struct Cycles {
+    groups: Vec<Cycle>,
+    /// Cycles per group.
+    size: u64,
+    /// Cycles in the last group.
+    filled: u64,
 }
 
-/// Cycles as columns; of many cycles, the largest values of each group, at the time of its first one.
-fn cycle_table(cycles: &[Cycle]) -> Table {
-    let group = cycles.len().div_ceil(MAX_CYCLES).max(1);
-    let mut table: Table = CYCLE_COLUMNS.map(|name| (name, Column::new(1))).into();
-    for cycles in cycles.chunks(group) {
-        for (index, name) in CYCLE_COLUMNS.iter().enumerate() {
-            let values = cycles.iter().map(|cycle| cycle.0[index]);
-            let value = match index {
-                0 => values.fold(f64::INFINITY, f64::min),
-                _ => values.fold(0.0, f64::max),
-            };
-            if let Some(column) = table.get_mut(name) {
-                column.push([value]);
+impl Cycles {
+    fn add(&mut self, cycle: Cycle) {
+        self.size = self.size.max(1);
+        match self.groups.last_mut() {
+            Some(group) if self.filled < self.size => {
+                group.join(&cycle);
+                self.filled += 1;
+            }
+            _ => {
+                if self.groups.len() == MAX_CYCLES {
+                    self.join_pairs();
+                }
+                self.groups.push(cycle);
+                self.filled = 1;
             }
         }
     }
-    table
+
+    /// Makes two groups one, all of them.
+    fn join_pairs(&mut self) {
+        let mut joined = Vec::with_capacity(MAX_CYCLES);
+        let mut groups = self.groups.drain(..);
+        while let Some(mut first) = groups.next() {
+            if let Some(second) = groups.next() {
+                first.join(&second);
+            }
+            joined.push(first);
+        }
+        drop(groups);
+        self.groups = joined;
+        self.size *= 2;
+    }
+
+    fn table(&self) -> Table {
+        let mut table: Table = CYCLE_COLUMNS.map(|name| (name, Column::new(1))).into();
+        for (index, name) in CYCLE_COLUMNS.iter().enumerate() {
+            if let Some(column) = table.get_mut(name) {
+                column.push(self.groups.iter().map(|cycle| cycle.0[index]));
+            }
+        }
+        table
+    }
+}
+
+impl Cycle {
+    /// The largest values of both, at the earlier time.
+    fn join(&mut self, other: &Self) {
+        for (index, (ours, theirs)) in self.0.iter_mut().zip(other.0).enumerate() {
+            *ours = if index == 0 { ours.min(theirs) } else { ours.max(theirs) };
+        }
+    }
+}
+
+/// One cycle as columns.
+pub fn cycle_table_of(command: &Command) -> Table {
+    Cycles { groups: vec![Cycle::new(command)], size: 1, filled: 1 }.table()
 }
 
 fn distance(a: &[f64; 3], b: &[f64; 3]) -> f64 {

@@ -16,7 +16,7 @@ use delmpc_controller_process::clock::monotonic_ns;
 use delmpc_controller_process::stop::StopFlag;
 use delmpc_messages::{FallbackLevel, Role};
 use delmpc_scenario::{Clock, FaultKind, FaultSettings, FaultTarget};
-use delmpc_transport::{RunId, SplitMix64};
+use delmpc_transport::{RunId, SplitMix64, runtime_folder};
 use rustix::process::{Pid, Signal, kill_process};
 use rustix::time::{ClockId, Timespec, clock_gettime, clock_settime};
 use serde::Serialize;
@@ -216,7 +216,7 @@ fn kill_runs(
 fn supervision(setup: &Setup, folder: &RunFolder, fault: &FaultSettings) -> Result<Supervision, Failure> {
     let role = if fault.target == FaultTarget::Plant { Role::Plant } else { Role::Controller };
     Ok(Supervision {
-        run: fresh_run(),
+        run: fresh_run()?,
         program: delmpc_program()?,
         arguments: vec![
             path_text(&folder.file("scenario.toml"))?,
@@ -227,6 +227,7 @@ fn supervision(setup: &Setup, folder: &RunFolder, fault: &FaultSettings) -> Resu
         steering: None,
         show_messages: false,
         hang_s: setup.scenario.process.hang_s,
+        lockstep: setup.scenario.clock == Clock::Lockstep,
         restarts: u32::from(fault.kind == FaultKind::Kill),
         late: (fault.kind == FaultKind::LateStart).then_some((role, fault.size_s)),
     })
@@ -302,10 +303,10 @@ fn send_signal(pid: u32, signal: Signal) {
     }
 }
 
-/// What a run has left in shared memory and in the folder for temporary files.
+/// What a run has left in shared memory and in the user's private folder.
 fn leftovers(run: RunId) -> Vec<PathBuf> {
     let mut left = Vec::new();
-    for folder in [PathBuf::from("/dev/shm"), std::env::temp_dir()] {
+    for folder in runtime_folder().into_iter().chain([PathBuf::from("/dev/shm")]) {
         let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
         left.extend(entries.map(|entry| entry.path()).filter(|path| {
             path.file_name().is_some_and(|name| name.to_string_lossy().contains(&run.to_string()))

@@ -9,6 +9,9 @@ use crate::timing::transport::TransportReport;
 /// Chance of calling a share of misses too large that is not.
 const SIGNIFICANCE: f64 = 0.05;
 
+/// Latencies below this cannot be measured (s): the clock counts nanoseconds.
+const LEAST_LATENCY_S: f64 = 1e-9;
+
 /// One threshold.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Criterion {
@@ -97,13 +100,20 @@ fn loop_criteria(
         |floor: &&FloorFigures| floor.loaded == figures.loaded && floor.core == measured.controller_core;
     if let Some(floor) = measured.occupied.iter().find(same) {
         let share = machine as f64 / figures.deadlines.max(1) as f64;
-        let of_floor = if machine == 0 { 0.0 } else { share / floor.missed_share() };
+        // A floor without a miss has a share of less than one in its deadlines; nothing is infinitely often as many.
+        let least_share = 1.0 / floor.deadlines.max(1) as f64;
+        let of_floor = if machine == 0 { 0.0 } else { share / floor.missed_share().max(least_share) };
         let (loop_misses, floor_misses) = ((machine, figures.deadlines), (floor.missed, floor.deadlines));
         let chance = chance_of_so_many(loop_misses, floor_misses, settings.misses_of_floor);
+        let within = of_floor <= settings.misses_of_floor;
+        let reason = match (within, chance >= SIGNIFICANCE) {
+            (false, true) => ", so nothing shows that it is not",
+            _ => "",
+        };
         list.push(Criterion {
-            kept: of_floor <= settings.misses_of_floor || chance >= SIGNIFICANCE,
+            kept: within || chance >= SIGNIFICANCE,
             note: format!(
-                "{machine} of {} deadlines, floor {} of {}; chance of so many if the limit were kept: {chance:.2}",
+                "{machine} of {} deadlines, floor {} of {}; chance of so many if the limit were kept: {chance:.2}{reason}",
                 figures.deadlines,
                 floor.missed,
                 floor.deadlines
@@ -126,7 +136,7 @@ fn loop_criteria(
             ..at_most(
                 "timing.wake_up_of_floor",
                 format!("{here}: wake-up latency, 99 %, over the floor's"),
-                wake_up / idle,
+                wake_up / idle.max(LEAST_LATENCY_S),
                 settings.wake_up_of_floor,
             )
         });

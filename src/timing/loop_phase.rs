@@ -47,7 +47,7 @@ pub fn run_loop(setup: &Setup, folder: &Path, stop: &StopFlag) -> Result<LoopRun
     folder.write_inputs(setup)?;
     let witnesses = start_witnesses(scenario)?;
     let supervision = Supervision {
-        run: fresh_run(),
+        run: fresh_run()?,
         program: std::env::current_exe().map_err(Failure::fault)?,
         arguments: vec![
             path_text(&folder.file("scenario.toml"))?,
@@ -59,6 +59,7 @@ pub fn run_loop(setup: &Setup, folder: &Path, stop: &StopFlag) -> Result<LoopRun
         steering: None,
         show_messages: false,
         hang_s: scenario.process.hang_s,
+        lockstep: false,
         restarts: 0,
         late: None,
     };

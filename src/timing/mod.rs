@@ -33,12 +33,16 @@ pub mod transport;
 
 use std::path::{Path, PathBuf};
 
+use delmpc_controller_process::machine::available_cores;
 use delmpc_controller_process::stop::StopFlag;
 use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::remove_dead_runs;
 use serde::Serialize;
 
+use crate::output::{line, print};
+use crate::run_folder::claim_or;
 use crate::setup::{FAULT_SCENARIO, Setup, scenario_file, scenario_file_or};
+use crate::supervisor::TIDY_UP;
 use crate::timing::criteria::{Criterion, Measured, criteria};
 use crate::timing::machine_facts::MachineFacts;
 use crate::timing::phases::{FloorFigures, LoopFigures, Phases, without_privileges};
@@ -128,11 +132,9 @@ pub fn timing(arguments: &TimingArguments) -> Result<Ended, Failure> {
         return faults(arguments);
     }
     let setup = timing_setup(arguments)?;
-    let folder = arguments.out.clone().unwrap_or_else(|| PathBuf::from("runs/timing"));
-    std::fs::create_dir_all(&folder)
-        .map_err(|error| Failure::Input(format!("--out {}: {error}", folder.display())))?;
+    let (folder, _lock) = claim_or(arguments.out.as_deref(), "runs/timing")?;
     let stop = StopFlag::on_signals().map_err(Failure::fault)?;
-    remove_dead_runs();
+    remove_dead_runs(TIDY_UP, || stop.is_set());
     let Some(report) = all_phases(arguments, &setup, &folder, &stop)? else {
         return Ok(Ended::Interrupted);
     };
@@ -141,10 +143,10 @@ pub fn timing(arguments: &TimingArguments) -> Result<Ended, Failure> {
     std::fs::write(&file, &json).map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))?;
     pictures::write(&report, &folder)?;
     if arguments.json {
-        println!("{json}");
+        line(&json)?;
     } else {
-        print!("{}", table::table(&report));
-        println!("{}", folder.display());
+        print(&table::table(&report))?;
+        line(folder.display())?;
     }
     verdict(&report)
 }
@@ -157,17 +159,16 @@ fn faults(arguments: &TimingArguments) -> Result<Ended, Failure> {
         return Err(Failure::Input(format!("{}: it has no [[fault]]", file.display())));
     }
     set_cores(arguments, &mut setup.scenario);
-    let folder = arguments.out.clone().unwrap_or_else(|| PathBuf::from("runs/faults"));
-    std::fs::create_dir_all(&folder)
-        .map_err(|error| Failure::Input(format!("--out {}: {error}", folder.display())))?;
+    check_cores(&setup.scenario)?;
+    let (folder, _lock) = claim_or(arguments.out.as_deref(), "runs/faults")?;
     let stop = StopFlag::on_signals().map_err(Failure::fault)?;
-    remove_dead_runs();
+    remove_dead_runs(TIDY_UP, || stop.is_set());
     if !arguments.json {
-        println!("{}", campaign::head());
+        line(campaign::head())?;
     }
     let tell = |trial: &campaign::Trial| {
         if !arguments.json {
-            println!("{}", campaign::line(trial));
+            let _ = line(campaign::line(trial));
         }
     };
     let trials = campaign::campaign(&setup, &folder, &stop, arguments.clock_jump, tell)?;
@@ -176,9 +177,9 @@ fn faults(arguments: &TimingArguments) -> Result<Ended, Failure> {
     let file = folder.join("faults.json");
     std::fs::write(&file, &json).map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))?;
     if arguments.json {
-        println!("{json}");
+        line(&json)?;
     } else {
-        println!("{}", file.display());
+        line(file.display())?;
     }
     let wrong: Vec<&str> = trials.iter().filter(|t| t.wrong.is_some()).map(|t| t.fault.as_str()).collect();
     if wrong.is_empty() {
@@ -199,7 +200,23 @@ fn timing_setup(arguments: &TimingArguments) -> Result<Setup, Failure> {
     scenario.clock = Clock::Realtime;
     scenario.duration_s = steps * scenario.plant.step_s;
     set_cores(arguments, scenario);
+    check_cores(scenario)?;
     Ok(setup)
+}
+
+/// Refuses cores that are not there, or not ours: found out later, it would cost the time of the floor.
+fn check_cores(scenario: &Scenario) -> Result<(), Failure> {
+    let ours = available_cores();
+    match loop_phase::cores_of(scenario).into_iter().find(|core| !ours.is_empty() && !ours.contains(core)) {
+        None => Ok(()),
+        Some(core) => {
+            let list: Vec<String> = ours.iter().map(usize::to_string).collect();
+            let list = list.join(", ");
+            Err(Failure::Input(format!(
+                "core {core} is not there, or not ours: those of this process are {list}; name two with --cores, or give --one-core"
+            )))
+        }
+    }
 }
 
 fn set_cores(arguments: &TimingArguments, scenario: &mut Scenario) {
@@ -226,7 +243,7 @@ fn all_phases(
     let loads: &[bool] = if arguments.no_load { &[false] } else { &[false, true] };
     let tell = |what: &str| {
         if !arguments.json {
-            crate::part::say(what);
+            crate::output::say(what);
         }
     };
     let (mut idle_floor, mut occupied_floor, mut loops) = (Vec::new(), Vec::new(), Vec::new());

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::ptr::NonNull;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use rustix::fs::{FallocateFlags, fallocate};
 use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
 
 /// The page: a number that goes to the peer and one that comes back, each on cache lines of its own.
@@ -28,8 +29,11 @@ impl RawFlag {
     /// When there is no shared memory.
     pub fn create(path: &Path) -> io::Result<Self> {
         let file = OpenOptions::new().read(true).write(true).create_new(true).open(path)?;
-        file.set_len(PAGE as u64)?;
-        match map(&file) {
+        // Taken from the file system now: where it is full, touching the page would end the process.
+        match fallocate(&file, FallocateFlags::empty(), 0, PAGE as u64)
+            .map_err(io::Error::from)
+            .and_then(|()| map(&file))
+        {
             Ok(page) => Ok(Self { page, file: Some(path.to_owned()) }),
             Err(error) => {
                 let _ = fs::remove_file(path);

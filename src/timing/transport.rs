@@ -127,7 +127,7 @@ fn beside_a_peer<R: Send>(
     answer: &str,
     work: impl FnOnce(RunId) -> Result<R, Failure> + Send,
 ) -> Result<R, Failure> {
-    let run = fresh_run();
+    let run = fresh_run()?;
     let done = std::thread::scope(|scope| {
         // Held until the work is over, and ended before the run is tidied up.
         let _peer = Peer::start(settings, run, answer)?;

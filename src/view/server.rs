@@ -1,13 +1,17 @@
-//! A server for one page and its stream, on loopback. A thread per connection, few connections, small requests.
+//! A server for one page and its stream, on loopback: few connections, small requests, a time for everything.
+//!
+//! A connection costs a thread only once the whole head of its request is there. Those that say nothing, or say it slowly, wait in a list
+//! until their time is over or newer ones push them out. A page that does not read is closed; of too many pages the oldest are.
 //!
 //! | request | answer |
 //! |---|---|
 //! | `GET /` | the page |
 //! | `GET /stream`, upgraded to a websocket | all rows so far, then each new one; hears wishes of [`crate::steering`] as text |
 
+use std::collections::VecDeque;
 use std::io::{ErrorKind, Write};
 use std::net::{Ipv4Addr, Shutdown, TcpListener, TcpStream};
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::{JoinHandle, sleep};
 use std::time::{Duration, Instant};
@@ -21,8 +25,18 @@ use crate::supervisor::PlantPipe;
 use crate::verdict::Failure;
 use crate::view::send_line;
 
-/// Most connections at a time.
+/// Most connections at a time whose request is there.
 const MOST_CONNECTIONS: usize = 16;
+/// Most pages of these; the newest stay. The rest is room for requests.
+const MOST_STREAMS: u64 = 8;
+/// Most connections that have not said what they want.
+const MOST_HALF_OPEN: usize = 64;
+/// Time for the head of a request.
+const HEAD_PATIENCE: Duration = Duration::from_secs(1);
+/// Bytes that may wait for a page that reads slowly.
+const MOST_UNREAD: usize = 1 << 20;
+/// Shortest time between two wishes of a page; a mouse makes some sixty a second.
+const WISH_PAUSE: Duration = Duration::from_millis(4);
 /// Most bytes of a request's head, and of a wish.
 const MOST_HEAD: usize = 8192;
 const MOST_WISH: usize = 256;
@@ -42,6 +56,8 @@ struct Shared {
     wish: Mutex<Wish>,
     pipe: PlantPipe,
     connections: AtomicUsize,
+    /// Pages opened so far.
+    streams: AtomicU64,
     opened: AtomicBool,
     ends: AtomicBool,
 }
@@ -69,11 +85,13 @@ impl Server {
             wish: Mutex::new(Wish::none()),
             pipe,
             connections: AtomicUsize::new(0),
+            streams: AtomicU64::new(0),
             opened: AtomicBool::new(false),
             ends: AtomicBool::new(false),
         });
         let for_acceptor = shared.clone();
-        let acceptor = Mutex::new(Some(std::thread::spawn(move || accept_all(&listener, &for_acceptor))));
+        let acceptor = std::thread::Builder::new().spawn(move || accept_all(&listener, &for_acceptor));
+        let acceptor = Mutex::new(Some(acceptor.map_err(Failure::fault)?));
         Ok(Self { shared, acceptor })
     }
 
@@ -124,32 +142,74 @@ fn held<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
+/// A connection that has not said what it wants.
+struct HalfOpen {
+    stream: TcpStream,
+    since: Instant,
+}
+
+/// How far a request has come.
+enum Head {
+    /// All of it; it is still in the stream.
+    Whole(String),
+    /// More has to come.
+    Part,
+    /// No more will come, or it is too long.
+    None,
+}
+
 fn accept_all(listener: &TcpListener, shared: &Arc<Shared>) {
+    let mut half_open = VecDeque::with_capacity(MOST_HALF_OPEN + 1);
     while !shared.ends.load(Ordering::Relaxed) {
-        let Ok((stream, _)) = listener.accept() else {
-            sleep(LOOK);
-            continue;
-        };
-        if shared.connections.fetch_add(1, Ordering::Relaxed) >= MOST_CONNECTIONS {
-            shared.connections.fetch_sub(1, Ordering::Relaxed);
-            continue; // dropped: closed
+        let accepted = listener.accept();
+        let idle = accepted.is_err();
+        if let Ok((stream, _)) = accepted
+            && stream.set_nonblocking(true).is_ok()
+        {
+            half_open.push_back(HalfOpen { stream, since: Instant::now() });
+            if half_open.len() > MOST_HALF_OPEN {
+                half_open.pop_front(); // dropped: closed
+            }
         }
-        let shared = shared.clone();
-        std::thread::spawn(move || {
-            // A connection that breaks is the reader's affair.
-            let _ = serve(stream, &shared);
-            shared.connections.fetch_sub(1, Ordering::Relaxed);
-        });
+        for _ in 0..half_open.len() {
+            let Some(HalfOpen { stream, since }) = half_open.pop_front() else { break };
+            match peek_head(&stream) {
+                Head::Whole(head) => begin_to_serve(stream, head, shared),
+                Head::Part if since.elapsed() < HEAD_PATIENCE => {
+                    half_open.push_back(HalfOpen { stream, since })
+                }
+                Head::Part | Head::None => {}
+            }
+        }
+        if idle {
+            sleep(LOOK);
+        }
     }
 }
 
-fn serve(stream: TcpStream, shared: &Shared) -> Result<(), Error> {
+/// Serves a request in a thread of its own, if there is room.
+fn begin_to_serve(stream: TcpStream, head: String, shared: &Arc<Shared>) {
+    if shared.connections.fetch_add(1, Ordering::Relaxed) >= MOST_CONNECTIONS {
+        shared.connections.fetch_sub(1, Ordering::Relaxed);
+        return;
+    }
+    let for_thread = shared.clone();
+    let thread = std::thread::Builder::new().spawn(move || {
+        // A connection that breaks is the reader's affair.
+        let _ = serve(stream, &head, &for_thread);
+        for_thread.connections.fetch_sub(1, Ordering::Relaxed);
+    });
+    if thread.is_err() {
+        shared.connections.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+fn serve(stream: TcpStream, head: &str, shared: &Shared) -> Result<(), Error> {
     stream.set_nonblocking(false)?;
     stream.set_nodelay(true)?;
     stream.set_read_timeout(Some(PATIENCE))?;
     stream.set_write_timeout(Some(PATIENCE))?;
-    let head = peek_head(&stream)?;
-    if !names_us(header(&head, "host"), shared.port) {
+    if !names_us(header(head, "host"), shared.port) {
         return answer(stream, "403 Forbidden", "text/plain", "this page is for this machine only\n");
     }
     let path = head.split(' ').nth(1).unwrap_or_default();
@@ -160,17 +220,21 @@ fn serve(stream: TcpStream, shared: &Shared) -> Result<(), Error> {
     }
 }
 
-/// The head of a request, left in the stream.
-fn peek_head(stream: &TcpStream) -> Result<String, Error> {
-    let mut bytes = vec![0; MOST_HEAD];
-    let begin = Instant::now();
-    loop {
-        let length = stream.peek(&mut bytes)?;
-        let head = String::from_utf8_lossy(&bytes[..length]);
-        if head.contains("\r\n\r\n") || length == 0 || length == MOST_HEAD || begin.elapsed() > PATIENCE {
-            return Ok(head.into_owned());
+/// Looks for the head of a request; leaves it in the stream and does not wait.
+fn peek_head(stream: &TcpStream) -> Head {
+    let mut bytes = [0; MOST_HEAD];
+    let length = match stream.peek(&mut bytes) {
+        Err(error) if [ErrorKind::WouldBlock, ErrorKind::Interrupted].contains(&error.kind()) => {
+            return Head::Part;
         }
-        sleep(Duration::from_millis(1));
+        Err(_) | Ok(0) => return Head::None,
+        Ok(length) => length,
+    };
+    let head = String::from_utf8_lossy(&bytes[..length]);
+    match head.contains("\r\n\r\n") {
+        true => Head::Whole(head.into_owned()),
+        false if length == MOST_HEAD => Head::None,
+        false => Head::Part,
     }
 }
 
@@ -210,7 +274,11 @@ fn listen_and_tell(stream: TcpStream, shared: &Shared) -> Result<(), Error> {
         *refusal.status_mut() = tungstenite::http::StatusCode::FORBIDDEN;
         Err(refusal)
     };
-    let config = WebSocketConfig::default().max_message_size(Some(MOST_WISH)).max_frame_size(Some(MOST_WISH));
+    let config = WebSocketConfig::default()
+        .max_message_size(Some(MOST_WISH))
+        .max_frame_size(Some(MOST_WISH))
+        .write_buffer_size(0)
+        .max_write_buffer_size(MOST_UNREAD);
     let Ok(mut socket) = tungstenite::accept_hdr_with_config(stream, ours, Some(config)) else {
         return Ok(());
     };
@@ -223,25 +291,39 @@ fn listen_and_tell(stream: TcpStream, shared: &Shared) -> Result<(), Error> {
 }
 
 fn converse(socket: &mut WebSocket<TcpStream>, shared: &Shared) -> Result<(), Error> {
+    let number = shared.streams.fetch_add(1, Ordering::Relaxed);
     let mut told = 0;
     loop {
         let ends = shared.ends.load(Ordering::Relaxed);
-        let news: Vec<Arc<str>> = held(&shared.rows).iter().skip(told).cloned().collect();
-        told += news.len();
-        for row in &news {
-            passing(socket.write(Message::text(&**row)))?;
+        loop {
+            // One at a time, and the next one when this one is out: what waits here is not read, and costs memory.
+            let Some(row) = held(&shared.rows).get(told).cloned() else { break };
+            told += 1;
+            tell(socket, &row)?;
         }
-        passing(socket.flush())?;
-        if ends {
+        let newer = shared.streams.load(Ordering::Relaxed).saturating_sub(number + 1);
+        if ends || newer >= MOST_STREAMS {
             return say_goodbye(socket);
         }
         match socket.read() {
-            Ok(Message::Text(line)) => wish(shared, &line),
+            Ok(Message::Text(line)) => {
+                wish(shared, &line);
+                sleep(WISH_PAUSE);
+            }
             Ok(Message::Close(_)) => return Ok(()),
-            Ok(_) => {}
+            Ok(_) => sleep(WISH_PAUSE),
             Err(error) => passing(Err(error))?,
         }
     }
+}
+
+/// Sends a row. Whoever has read nothing in the time a write may take is gone; a signal to the process is nobody's fault.
+fn tell(socket: &mut WebSocket<TcpStream>, row: &str) -> Result<(), Error> {
+    let mut told = socket.send(Message::text(row));
+    while matches!(&told, Err(Error::Io(error)) if error.kind() == ErrorKind::Interrupted) {
+        told = socket.flush();
+    }
+    told
 }
 
 /// Closes, and reads until the other end has closed too: what it has not read yet would be lost otherwise.
@@ -302,6 +384,37 @@ mod tests {
         assert!(get("/", &format!("127.0.0.1.evil.example:{port}")).starts_with("HTTP/1.1 403 "));
         assert!(ask(port, "POST / HTTP/1.1\r\n\r\n").starts_with("HTTP/1.1 403 "));
         assert!(!server.has_been_opened());
+        server.finish();
+    }
+
+    #[test]
+    fn those_who_say_nothing_or_say_it_slowly_do_not_keep_others_out() {
+        let server = Server::start(0, "<p>page".to_owned(), PlantPipe::default()).unwrap();
+        let port = server.port();
+        let connect = || TcpStream::connect((Ipv4Addr::LOCALHOST, port)).unwrap();
+        let us = format!("127.0.0.1:{port}");
+        let page = || ask(port, &format!("GET / HTTP/1.1\r\nHost: {us}\r\n\r\n"));
+        let mut half_open: Vec<TcpStream> = (0..200).map(|_| connect()).collect();
+        for stream in &mut half_open[100..] {
+            let _ = stream.write_all(format!("GET /stream HTTP/1.1\r\nHost: {us}\r\nX-").as_bytes());
+        }
+        for _ in 0..20 {
+            let begin = Instant::now();
+            assert!(page().ends_with("<p>page"));
+            assert!(begin.elapsed() < HEAD_PATIENCE, "the page came after the others had given up");
+            let mut newcomer = connect();
+            let _ = newcomer.write_all(b"G");
+            half_open.push(newcomer);
+        }
+        // Their time is over at some moment, however slowly they go on.
+        let mut slow = connect();
+        slow.set_read_timeout(Some(Duration::from_millis(50))).unwrap();
+        let begin = Instant::now();
+        while slow.write_all(b"x").is_ok()
+            && slow.read(&mut [0]).is_err_and(|e| e.kind() == ErrorKind::WouldBlock)
+        {
+            assert!(begin.elapsed() < 10 * HEAD_PATIENCE, "still open");
+        }
         server.finish();
     }
 

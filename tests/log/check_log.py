@@ -23,19 +23,29 @@ def read_fields(lines, types, data, offset):
         count = 1
         if kind.endswith("]"):
             kind, count = kind[:-1].split("[")
-            count = int(count)
+            if count.startswith("<="):
+                offset += -offset % 4
+                (found,) = struct.unpack_from("<I", data, offset)
+                assert found <= int(count[2:]), (line, found)
+                offset += 4
+                count = found
+            else:
+                count = int(count)
+            many = True
+        else:
+            many = False
         if kind in types:
             parts = []
             for _ in range(count):
                 offset += -offset % 8
                 part, offset = read_fields(types[kind], types, data, offset)
                 parts.append(part)
-            fields[name] = parts[0] if count == 1 else parts
+            fields[name] = parts if many else parts[0]
             continue
         letter, width = WIDTH[kind]
         offset += -offset % width
         values = struct.unpack_from(f"<{count}{letter}", data, offset)
-        fields[name] = values[0] if count == 1 else values
+        fields[name] = values if many else values[0]
         offset += count * width
     return fields, offset
 
@@ -88,7 +98,8 @@ def main(folder):
             elif channel.topic == "/controller/command" and seen[channel.topic] == 1:
                 command = decode(schema, message.data)
                 assert command["header"]["magic"] and command["n_joints"] == 30
-                begins = [segment["begin_ns"] for segment in command["segments"][: command["n_segments"]]]
+                assert len(command["segments"]) == command["n_segments"] and len(command["gain"]) == 2 * 30 * 30
+                begins = [segment["begin_ns"] for segment in command["segments"]]
                 assert begins[0] == 0 and begins == sorted(set(begins)), begins
         (about,) = (record.metadata for record in reader.iter_metadata() if record.name == "run")
         files = {attachment.name: attachment.data for attachment in reader.iter_attachments()}

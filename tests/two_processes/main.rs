@@ -97,6 +97,24 @@ fn a_process_that_stops_for_good_is_a_fault() {
     }
 }
 
+/// In lockstep the wall clock decides nothing: a process that is stopped again and again, for much longer than a hang together, goes on.
+#[test]
+fn in_lockstep_a_process_that_gets_its_core_now_and_then_is_never_given_up() {
+    let folder = Folder::new("starved");
+    let more =
+        ["--set", "clock=lockstep", "--set", "duration_s=0.5", "--set", "process.hang_s=0.4", "--no-report"];
+    let run = Delmpc::run(&folder, &more);
+    let family = wait_for("both processes", || Some(children(run.pid())).filter(|family| family.len() == 2));
+    for turn in 0..8 {
+        let pid = member(&family, ["plant", "controller"][turn % 2]).pid;
+        support::signal(pid, Signal::STOP);
+        std::thread::sleep(std::time::Duration::from_millis(200));
+        support::signal(pid, Signal::CONT);
+    }
+    let ended = run.wait();
+    assert_eq!(ended.status, Some(0), "{}", ended.errors);
+}
+
 #[test]
 fn a_process_that_stops_for_50_ms_is_not() {
     let folder = Folder::new("pause");

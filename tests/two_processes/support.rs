@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
+use delmpc_transport::runtime_folder;
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
@@ -162,11 +163,11 @@ pub fn is_alive(pid: u32) -> bool {
     stat.rsplit(") ").next().is_some_and(|rest| !rest.is_empty() && !rest.starts_with(['Z', 'X']))
 }
 
-/// Names of what a run has in shared memory and in the folder for temporary files.
+/// Names of what a run has in shared memory and in the user's private folder.
 pub fn shared_memory_of(run_id: &str) -> Vec<String> {
     assert_eq!(run_id.len(), 16, "{run_id:?}");
     let mut names = Vec::new();
-    for folder in [PathBuf::from("/dev/shm"), std::env::temp_dir()] {
+    for folder in [PathBuf::from("/dev/shm"), runtime_folder().unwrap()] {
         for entry in fs::read_dir(folder).unwrap().flatten() {
             let name = entry.file_name().to_string_lossy().into_owned();
             if name.contains(run_id) {

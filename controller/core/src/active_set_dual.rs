@@ -20,7 +20,7 @@ use alloc::vec::Vec;
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
 use faer::{Mat, MatRef, Par};
 
-use crate::dual_qp::{DualReport, QpSolver, check_data, dual_residual};
+use crate::dual_qp::{Convexity, DualReport, QpSolver, UNBOUNDED, check_answer, check_data, dual_residual};
 use crate::errors::QpError;
 use crate::kernels::{CholeskyScratch, factor, vector_mut};
 
@@ -36,6 +36,11 @@ const MAX_SWEEPS: u32 = 2000;
 const MISPLACED: f64 = 1e-12;
 /// Coordinate descent is done below this residual, relative to the largest slack.
 const SWEEP_TOLERANCE: f64 = 1e-9;
+
+/// An answer that misses the optimality conditions by more than this, relative to the largest slack, is none.
+const LARGEST_MISS: f64 = 1e-5;
+/// A gradient below this, relative to the largest slack, vanishes.
+const STATIONARY: f64 = 1e-6;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Side {
@@ -54,6 +59,9 @@ pub struct ActiveSetDual {
     gradient: Vec<f64>,
     scratch: CholeskyScratch,
     start: Vec<f64>,
+    convexity: Convexity,
+    /// The last partitions settled on multipliers that only the regularisation holds.
+    diverged: bool,
 }
 
 impl ActiveSetDual {
@@ -67,6 +75,8 @@ impl ActiveSetDual {
             gradient: vec![0.0; capacity],
             scratch: CholeskyScratch::new(capacity),
             start: Vec::with_capacity(capacity),
+            convexity: Convexity::new(capacity),
+            diverged: false,
         }
     }
 
@@ -173,6 +183,7 @@ impl ActiveSetDual {
     ) -> Option<DualReport> {
         let rows = slack.len();
         let tolerance = MISPLACED * (1.0 + crate::kernels::largest(slack));
+        self.diverged = false;
         let mut fewest = usize::MAX;
         let mut patience = PATIENCE;
         for iterations in 1..=limit {
@@ -180,6 +191,12 @@ impl ActiveSetDual {
             let misplaced = |set: &Self, i: usize, y: &[f64]| set.better_side(i, y, upper, tolerance);
             let count = (0..rows).filter(|&i| misplaced(self, i, y).is_some()).count();
             if count == 0 {
+                // Without a minimum it is the regularisation that holds the multipliers, and the gradient does not vanish.
+                let scale = crate::kernels::largest(slack);
+                if crate::kernels::largest(y) > UNBOUNDED * scale && !self.is_stationary(y, scale) {
+                    self.diverged = true;
+                    return None;
+                }
                 for (value, limit) in y.iter_mut().zip(upper) {
                     *value = value.clamp(0.0, limit.max(0.0));
                 }
@@ -203,6 +220,13 @@ impl ActiveSetDual {
             }
         }
         None
+    }
+
+    /// Whether the gradient of the free rows vanishes.
+    fn is_stationary(&self, y: &[f64], scale: f64) -> bool {
+        let rows = self.sides.iter().zip(&self.gradient).take(y.len());
+        rows.filter(|(side, _)| **side == Side::Free)
+            .all(|(_, gradient)| gradient.abs() <= STATIONARY * scale)
     }
 
     /// The side a row should change to, if it is misplaced.
@@ -252,21 +276,20 @@ impl QpSolver for ActiveSetDual {
         for (side, h) in self.sides.iter_mut().zip(slack) {
             *side = if *h < 0.0 { Side::Free } else { Side::Zero };
         }
+        self.convexity.check(gram, slack.len())?;
         if let Some(report) = self.pivot(gram, slack, upper, y, MAX_PARTITIONS) {
+            check_answer(gram, slack, upper, y, report.iterations, LARGEST_MISS)?;
             return Ok(report);
+        }
+        if self.diverged {
+            return Err(QpError::Unbounded);
         }
         for (value, limit) in y.iter_mut().zip(upper) {
             *value = if value.is_finite() { value.clamp(0.0, limit.max(0.0)) } else { 0.0 };
         }
-        let (sweeps, residual) = Self::coordinate_descent(gram, slack, upper, y);
+        let (sweeps, _) = Self::coordinate_descent(gram, slack, upper, y);
         let iterations = MAX_PARTITIONS + sweeps;
-        if residual > 1e-3 * (1.0 + crate::kernels::largest(slack)) {
-            return Err(QpError::NotConverged { iterations });
-        }
-        finish(y, iterations)
+        check_answer(gram, slack, upper, y, iterations, LARGEST_MISS)?;
+        Ok(DualReport { iterations })
     }
-}
-
-fn finish(y: &[f64], iterations: u32) -> Result<DualReport, QpError> {
-    if crate::kernels::all_finite(y) { Ok(DualReport { iterations }) } else { Err(QpError::NotFinite) }
 }

@@ -2,6 +2,8 @@
 
 use alloc::vec::Vec;
 
+use delmpc_messages::LONGEST_VALIDITY_NS;
+
 use crate::errors::ControlError;
 use crate::fallback::FallbackConfig;
 use crate::projected_qp::ProjectedQpOptions;
@@ -179,6 +181,11 @@ impl ControllerConfig {
         not_negative("trim time", self.trim_s)?;
         positive("state age", self.max_state_age_s)?;
         positive("command life", self.command_life_s)?;
+        let longest_s = LONGEST_VALIDITY_NS as f64 * 1e-9;
+        if self.command_life_s > longest_s {
+            let (quantity, value) = ("command life", self.command_life_s);
+            return Err(ControlError::Value { quantity, index: 0, value, rule: "must be at most 20 s" });
+        }
         positive("cycle budget", self.budget_s)?;
         positive("mismatch rate", self.mismatch_rate)?;
         let lengths = self.stage_lengths();

@@ -52,6 +52,9 @@ use crate::unloaded_leg::UnloadedLeg;
 mod goal;
 mod law_of_level;
 
+/// So many states in a row that are older than the newest one are right, and the newest one was wrong.
+const OLDER_STATES: u32 = 5;
+
 /// Reasons for refusing a state that are the controller's own ([`Command::reason`]); below 100 they are the message's.
 pub mod reason {
     /// The measurement is too old.
@@ -149,6 +152,8 @@ pub struct Controller {
 
     origin_ns: Option<u64>,
     last_state_ns: Option<u64>,
+    /// States in a row that were older than the newest one.
+    older_states: u32,
     last_sequence: u64,
 }
 
@@ -246,6 +251,7 @@ impl Controller {
             command,
             origin_ns: None,
             last_state_ns: None,
+            older_states: 0,
             last_sequence: 0,
             model,
             config,
@@ -285,7 +291,8 @@ impl Controller {
         let level = self.ladder.advance(&situation);
         self.write_command(level, state, now_ns);
 
-        let total_ns = self.command.report.total_ns + clock.now_ns().saturating_sub(begin);
+        let spent_ns = clock.now_ns().saturating_sub(begin);
+        let total_ns = self.command.report.total_ns.saturating_add(spent_ns);
         self.command.report.total_ns = total_ns;
         let late = total_ns as f64 * 1e-9 > self.config.budget_s;
         if late && self.command.verdict == Verdict::Ok as u32 {
@@ -341,9 +348,9 @@ impl Controller {
         let begin_ns = clock.now_ns();
         // One that was held up says nothing about the next one.
         let usual_ns = self.preparations_ns.iter().copied().fold(u64::MAX, u64::min);
-        let ready_s = (begin_ns.saturating_sub(self.cycle_began_ns) + usual_ns) as f64 * 1e-9;
+        let ready_s = begin_ns.saturating_sub(self.cycle_began_ns).saturating_add(usual_ns) as f64 * 1e-9;
         let periods = libm::ceil(ready_s / self.config.period_s).max(1.0);
-        let next_ns = last_ns + to_ns(periods * self.config.period_s);
+        let next_ns = last_ns.saturating_add(to_ns(periods * self.config.period_s));
         let start_s = self.run_time_s(next_ns) + self.config.delay_s;
         self.prepared = self.prepare_for(start_s, &mut StopWatch::start(clock)).ok();
         self.preparations_ns.rotate_right(1);
@@ -375,8 +382,15 @@ impl Controller {
             return Err(reason::AHEAD);
         }
         if self.last_state_ns.is_some_and(|last| state.time_ns < last) {
-            return Err(reason::OUT_OF_ORDER);
+            self.older_states += 1;
+            if self.older_states < OLDER_STATES {
+                return Err(reason::OUT_OF_ORDER);
+            }
+            // It was the newest one whose time was wrong.
+            (self.last_state_ns, self.has_plan, self.has_prediction) = (None, false, false);
+            self.prepared = None;
         }
+        self.older_states = 0;
         self.estimator.update(&self.model, state).map_err(|_| reason::ESTIMATOR)?;
         self.origin_ns.get_or_insert(state.time_ns);
         let since_last_s = self.last_state_ns.map_or(0.0, |last| (state.time_ns - last) as f64 * 1e-9);

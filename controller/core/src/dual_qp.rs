@@ -7,9 +7,15 @@
 //! `h` is the slack of every row at the unconstrained optimum (negative: violated), `ρ` the exact penalty of a soft row
 //! (infinite: hard). See [`crate::projected_qp`] for where it comes from.
 
-use faer::MatRef;
+use faer::{Mat, MatRef};
 
 use crate::errors::QpError;
+use crate::kernels::{CholeskyScratch, factor, largest};
+
+/// A matrix with an eigenvalue below this, relative to its largest diagonal entry, is not one of a convex problem.
+const INDEFINITE: f64 = 1e-9;
+/// Multipliers this large, relative to the largest slack, belong to a problem without a minimum.
+pub(crate) const UNBOUNDED: f64 = 1e9;
 
 /// What a solve took.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -47,7 +53,7 @@ pub trait QpSolver: core::fmt::Debug {
 ///
 /// # Errors
 /// [`QpError::TooLarge`] for more rows than it has room for, [`QpError::NotFinite`] for a number that is not finite (an upper bound
-/// may be infinite).
+/// may be infinite), [`QpError::EmptyBox`] for an upper bound below zero.
 pub(crate) fn check_data(
     capacity: usize,
     gram: MatRef<'_, f64>,
@@ -62,7 +68,73 @@ pub(crate) fn check_data(
     if !finite_gram || !crate::kernels::all_finite(slack) || upper.iter().any(|u| u.is_nan()) {
         return Err(QpError::NotFinite);
     }
-    Ok(())
+    match upper.iter().take(rows).position(|upper| *upper < 0.0) {
+        Some(row) => Err(QpError::EmptyBox { row }),
+        None => Ok(()),
+    }
+}
+
+/// Whether problems have a minimum at all, by a Cholesky factorisation of `Γ` moved a little into the positive.
+#[derive(Debug)]
+pub(crate) struct Convexity {
+    block: Mat<f64>,
+    scratch: CholeskyScratch,
+}
+
+impl Convexity {
+    /// Room for `capacity` rows.
+    pub(crate) fn new(capacity: usize) -> Self {
+        Self { block: Mat::zeros(capacity, capacity), scratch: CholeskyScratch::new(capacity) }
+    }
+
+    /// Refuses a matrix of `rows` rows that is not symmetric positive semidefinite. O(rows³), no allocation.
+    ///
+    /// # Errors
+    /// [`QpError::NotConvex`].
+    pub(crate) fn check(&mut self, gram: MatRef<'_, f64>, rows: usize) -> Result<(), QpError> {
+        let top = (0..rows).fold(0.0f64, |top, i| top.max(gram[(i, i)]));
+        let mut block = self.block.as_mut().submatrix_mut(0, 0, rows, rows);
+        for j in 0..rows {
+            for i in j..rows {
+                block[(i, j)] = gram[(i, j)];
+                if (gram[(i, j)] - gram[(j, i)]).abs() > INDEFINITE * top {
+                    return Err(QpError::NotConvex);
+                }
+            }
+            block[(j, j)] += INDEFINITE * top.max(f64::MIN_POSITIVE / INDEFINITE);
+        }
+        match rows {
+            0 => Ok(()),
+            _ => factor(block, &mut self.scratch).ok_or(QpError::NotConvex),
+        }
+    }
+}
+
+/// Refuses multipliers that do not solve the problem to `largest_miss` times the largest slack. O(r²), no allocation.
+///
+/// # Errors
+/// [`QpError::NotFinite`], [`QpError::Unbounded`], [`QpError::NotConverged`].
+pub(crate) fn check_answer(
+    gram: MatRef<'_, f64>,
+    slack: &[f64],
+    upper: &[f64],
+    y: &[f64],
+    iterations: u32,
+    largest_miss: f64,
+) -> Result<(), QpError> {
+    if !crate::kernels::all_finite(y) {
+        return Err(QpError::NotFinite);
+    }
+    let scale = largest(slack);
+    let residual = dual_residual(gram, slack, upper, y);
+    if residual <= largest_miss * scale {
+        return Ok(());
+    }
+    Err(if largest(y) > UNBOUNDED * scale {
+        QpError::Unbounded
+    } else {
+        QpError::NotConverged { iterations }
+    })
 }
 
 /// Largest violation of the optimality conditions of `y`: `|y - clamp(y - (Γ y + h), 0, ρ)|`. Zero exactly at a solution.

@@ -71,6 +71,18 @@ pub enum QpError {
         /// Iterations made.
         iterations: u32,
     },
+    /// The matrix is not positive semidefinite: the problem has no minimum, or many.
+    #[error("the QP matrix is not symmetric positive semidefinite")]
+    NotConvex,
+    /// The objective falls without bound: hard rows contradict each other.
+    #[error("the dual QP is unbounded: its hard rows contradict each other")]
+    Unbounded,
+    /// Nothing lies between the bounds of a multiplier.
+    #[error("the upper bound of row {row} is below zero")]
+    EmptyBox {
+        /// The row.
+        row: usize,
+    },
     /// More rows than the solver has room for.
     #[error("{rows} rows, room for {capacity}")]
     TooLarge {

@@ -52,6 +52,38 @@ fn bad_states_are_refused_by_name_and_the_ladder_is_climbed_back() {
     assert_eq!(cycle(&|_| {}, 238, 0).1, 0);
 }
 
+/// The time a controller is told may come from the state itself: one damaged time must not make all true states look old for ever.
+#[test]
+fn a_time_that_ran_ahead_is_forgotten_and_times_at_the_end_of_all_numbers_are_refused() {
+    let atlas = atlas();
+    let plant = &mut WeldedPlant::new(&atlas);
+    let n = plant.rate.len();
+    let good = plant.measure();
+    let mut controller = Controller::new(atlas.controller_model(), ControllerConfig::default()).unwrap();
+    let mut cycle = |time_ns: u64, now_ns: u64| {
+        let mut state = good;
+        state.time_ns = time_ns;
+        let command = *controller.cycle(&state, now_ns, &StoppedClock);
+        controller.prepare(&StoppedClock);
+        command
+    };
+    assert_eq!(cycle(PERIOD_NS, PERIOD_NS).reason, 0);
+    let hour_ns = 3_600_000_000_000;
+    assert_eq!(cycle(hour_ns, hour_ns).reason, 0, "nothing says that it is wrong");
+    let reasons: Vec<u32> = (2..9).map(|k| cycle(k * PERIOD_NS, k * PERIOD_NS).reason).collect();
+    assert_eq!(reasons[..4], [reason::OUT_OF_ORDER; 4]);
+    assert_eq!(reasons[4..], [0; 3]);
+    for time_ns in [u64::MAX, u64::MAX - 1, 1 << 63, (1 << 62) + 1] {
+        assert!(cycle(time_ns, time_ns).reason != 0, "{time_ns}");
+        cycle(9 * PERIOD_NS, u64::MAX);
+    }
+    for k in 10..20 {
+        let command = cycle(k * PERIOD_NS, k * PERIOD_NS);
+        command.validate(plant.model.joint_set_hash, n).unwrap();
+        assert_eq!(command.reason, 0);
+    }
+}
+
 #[test]
 fn garbage_gives_finite_commands() {
     let atlas = atlas();

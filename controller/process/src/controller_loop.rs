@@ -68,8 +68,6 @@ pub struct ControllerLoop<'a, S, P> {
 impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S, P> {
     /// A loop for a scenario. `blank` is a command with run, joint set and joint count filled in.
     pub fn new(scenario: &'a Scenario, states: S, commands: P, blank: &Command) -> Self {
-        // Half as much again as the run needs: states may be slow to come.
-        let cycles = 1.5 * scenario.duration_s * scenario.controller.mpc_rate_hz;
         Self {
             scenario,
             states,
@@ -78,7 +76,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
             command: Box::new(*blank),
             delay_ns: (scenario.sensors.delay_s * 1e9).round() as u64,
             allocations: None,
-            figures: CycleFigures::with_capacity(cycles as usize + 1000),
+            figures: CycleFigures::new(),
             records: Records::none(),
         }
     }
@@ -86,7 +84,9 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
     /// Keeps a record of every cycle.
     #[must_use]
     pub fn recording(mut self) -> Self {
-        self.records = Records::with_capacity(self.figures.capacity());
+        // Half as much again as the run needs: states may be slow to come.
+        let cycles = 1.5 * self.scenario.duration_s * self.scenario.controller.mpc_rate_hz;
+        self.records = Records::with_capacity(cycles as usize + 1000);
         self
     }
 
@@ -129,7 +129,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
                 return Ok(Ending::Ordered(order));
             }
             let news = self.receive()?;
-            if self.plant_is_done() {
+            if self.plant_is_done() || (!news && membership.peer_is_done()) {
                 return Ok(Ending::Finished);
             }
             if !running && self.state.header.sequence > 1 {
@@ -165,6 +165,10 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
                 return Ok(Ending::Ordered(order));
             }
             if !self.receive()? {
+                // It said so without us having seen its last state.
+                if membership.peer_is_done() {
+                    return Ok(Ending::Finished);
+                }
                 self.commands.serve_newcomers()?;
                 sleep(PAUSE);
                 continue;
@@ -195,14 +199,15 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
         &self.figures
     }
 
-    /// Takes the latest state; says whether it is a new one.
+    /// Takes the latest state; says whether it is a new one. One of another run is none.
     fn receive(&mut self) -> Result<bool, LinkError> {
+        let run_id = self.command.header.run_id;
         match self.states.receive_latest()? {
-            Some(state) => {
+            Some(state) if state.header.validate_run::<PlantState>(run_id).is_ok() => {
                 *self.state = *state;
                 Ok(true)
             }
-            None => Ok(false),
+            _ => Ok(false),
         }
     }
 
@@ -212,15 +217,21 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
 
     fn first_answer_given(&mut self, membership: &mut impl Attendance) -> Result<(), LinkError> {
         // What the first cycles cost is not what a cycle costs.
-        self.figures = CycleFigures::with_capacity(self.figures.capacity());
+        self.figures = CycleFigures::new();
         self.records.clear();
         membership.announce(ProcessState::Ready)
     }
 
+    /// The present time by the plant's clock, when the latest state was sent `age_ns` ago.
+    fn now_ns(&self, age_ns: u64) -> u64 {
+        self.state.time_ns.saturating_add(self.delay_ns).saturating_add(age_ns)
+    }
+
     /// Cycles nobody hears of, so that the first ones that count find caches, pages and branch predictors as all others do.
     fn warm_up(&mut self, controller: &mut impl Controller) {
+        let now_ns = self.now_ns(0);
         for _ in 0..WARM_UP_CYCLES {
-            controller.cycle(&self.state, self.state.time_ns + self.delay_ns, &mut self.command);
+            controller.cycle(&self.state, now_ns, &mut self.command);
             controller.prepare();
         }
     }
@@ -235,9 +246,10 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
         // stands still until the first answer.
         let runs = realtime && self.state.header.sequence > 1;
         let age_ns = if runs { begin_ns.saturating_sub(measured_ns) } else { 0 };
+        let now_ns = self.now_ns(age_ns);
         let command = self.command.as_mut();
         let before = self.allocations.map_or(0, |count| count());
-        controller.cycle(&self.state, self.state.time_ns + self.delay_ns + age_ns, command);
+        controller.cycle(&self.state, now_ns, command);
 
         let after = self.allocations.map_or(0, |count| count());
         command.report.allocations = (after - before) as u32;
@@ -259,7 +271,6 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
             linearize_ns: command.report.linearize_ns,
             riccati_ns: command.report.riccati_ns,
             qp_ns: command.report.qp_ns,
-            age_ns: if realtime { sent_ns.saturating_sub(measured_ns) } else { 0 },
         };
         self.figures.add(command, figure);
         command.report.publish_ns = if realtime { sent_ns - computed_ns } else { 0 };
@@ -279,12 +290,37 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
     }
 }
 
+/// More than a controller counts in a run: a number of the plant's that is farther ahead than this is damaged.
+const LARGEST_JUMP: u64 = 10_000_000;
+
 /// Says which state a command answers, and numbers it: higher than all before, those of a controller that is gone included.
 pub fn address(command: &mut Command, state: &PlantState) {
-    command.header.sequence = command.header.sequence.max(state.applied_command_sequence) + 1;
+    let (ours, applied) = (command.header.sequence, state.applied_command_sequence);
+    let believed = ours == 0 || applied.saturating_sub(ours) <= LARGEST_JUMP;
+    command.header.sequence = if believed { ours.max(applied) } else { ours }.saturating_add(1);
     command.state_sequence = state.header.sequence;
     if state.header.sequence <= 1 {
         // The plant that waits for its first answer has had commands before, as far as the robot is concerned.
         command.valid_from_ns = state.time_ns;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_successor_counts_on_and_a_damaged_number_is_not_believed() {
+        let (mut command, mut state) = (Command::new(1, 2, 3), PlantState::new(1, 2, 3));
+        state.header.sequence = 9;
+        state.applied_command_sequence = 5_000;
+        address(&mut command, &state);
+        assert_eq!((command.header.sequence, command.state_sequence), (5_001, 9));
+        state.applied_command_sequence = u64::MAX;
+        address(&mut command, &state);
+        assert_eq!(command.header.sequence, 5_002);
+        state.applied_command_sequence = 6_000;
+        address(&mut command, &state);
+        assert_eq!(command.header.sequence, 6_001);
     }
 }

@@ -2,7 +2,9 @@
 
 use delmpc_messages::{Command, CycleReport, FallbackLevel, Verdict};
 
-/// Figures kept of each cycle.
+use crate::durations::Durations;
+
+/// What one cycle took.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CycleFigure {
     /// Everything computed for the command, what was prepared ahead included, from the tick on (ns).
@@ -15,14 +17,27 @@ pub struct CycleFigure {
     pub riccati_ns: u64,
     /// Constrained QP (ns).
     pub qp_ns: u64,
-    /// From the measurement to the command sent, by the monotonic clock (ns).
-    pub age_ns: u64,
 }
 
-/// All cycles of a run.
+/// What all cycles of a run took.
+#[derive(Debug, Clone, Default)]
+pub struct CycleDurations {
+    /// Of [`CycleFigure::total_ns`].
+    pub total: Durations,
+    /// Of [`CycleFigure::feedback_ns`].
+    pub feedback: Durations,
+    /// Of [`CycleFigure::linearize_ns`].
+    pub linearize: Durations,
+    /// Of [`CycleFigure::riccati_ns`].
+    pub riccati: Durations,
+    /// Of [`CycleFigure::qp_ns`].
+    pub qp: Durations,
+}
+
+/// All cycles of a run. Its memory does not grow with them.
 #[derive(Debug, Clone, Default)]
 pub struct CycleFigures {
-    cycles: Vec<CycleFigure>,
+    durations: CycleDurations,
     /// Cycles whose command was not out one period after their tick, and ticks that were slept through.
     pub deadline_misses: u64,
     /// QP solves, over all cycles.
@@ -40,15 +55,29 @@ pub struct CycleFigures {
 }
 
 impl CycleFigures {
-    /// Room for `capacity` cycles; more are counted, but not in the percentiles.
-    pub fn with_capacity(capacity: usize) -> Self {
-        Self { cycles: Vec::with_capacity(capacity), ..Self::default() }
+    /// Creates the figures of a run without any cycle.
+    pub fn new() -> Self {
+        let durations = CycleDurations {
+            total: Durations::new(),
+            feedback: Durations::new(),
+            linearize: Durations::new(),
+            riccati: Durations::new(),
+            qp: Durations::new(),
+        };
+        Self { durations, ..Self::default() }
     }
 
-    /// Takes in a cycle.
+    /// Takes in a cycle. No allocation.
     pub fn add(&mut self, command: &Command, figure: CycleFigure) {
-        if self.cycles.len() < self.cycles.capacity() {
-            self.cycles.push(figure);
+        let CycleDurations { total, feedback, linearize, riccati, qp } = &mut self.durations;
+        for (durations, time_ns) in [
+            (total, figure.total_ns),
+            (feedback, figure.feedback_ns),
+            (linearize, figure.linearize_ns),
+            (riccati, figure.riccati_ns),
+            (qp, figure.qp_ns),
+        ] {
+            durations.add(time_ns);
         }
         let report: &CycleReport = &command.report;
         self.qp_solves += u64::from(report.qp_solves);
@@ -58,11 +87,6 @@ impl CycleFigures {
         let verdict = command.verdict().unwrap_or(Verdict::BadState);
         self.verdicts[verdict as usize] += 1;
         self.states_refused += u64::from(verdict == Verdict::BadState);
-    }
-
-    /// Cycles there is room for.
-    pub fn capacity(&self) -> usize {
-        self.cycles.capacity()
     }
 
     /// Cycles.
@@ -75,35 +99,8 @@ impl CycleFigures {
         FallbackLevel::from_code(self.fallback_level_max)
     }
 
-    /// Percentiles (0..1) of one figure, s; `None` without cycles.
-    pub fn percentiles_s<const N: usize>(
-        &self,
-        figure: impl Fn(&CycleFigure) -> u64,
-        at: [f64; N],
-    ) -> [Option<f64>; N] {
-        let mut values: Vec<u64> = self.cycles.iter().map(figure).collect();
-        values.sort_unstable();
-        at.map(|part| percentile(&values, part).map(|ns| ns as f64 * 1e-9))
-    }
-}
-
-/// Nearest-rank percentile of sorted values.
-pub fn percentile(sorted: &[u64], part: f64) -> Option<u64> {
-    let rank = (part * sorted.len() as f64).ceil() as usize;
-    sorted.get(rank.clamp(1, sorted.len().max(1)) - 1).copied()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn percentiles_are_values_that_occurred() {
-        let values: Vec<u64> = (1..=1000).collect();
-        assert_eq!(percentile(&values, 0.5), Some(500));
-        assert_eq!(percentile(&values, 0.999), Some(999));
-        assert_eq!(percentile(&values, 1.0), Some(1000));
-        assert_eq!(percentile(&[7], 0.0), Some(7));
-        assert_eq!(percentile(&[], 0.5), None);
+    /// What the cycles took.
+    pub fn durations(&self) -> &CycleDurations {
+        &self.durations
     }
 }

@@ -16,6 +16,7 @@
 pub mod awake;
 pub mod clock;
 pub mod controller_loop;
+pub mod durations;
 pub mod figures;
 pub mod machine;
 pub mod membership;

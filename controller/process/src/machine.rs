@@ -3,7 +3,7 @@
 use delmpc_scenario::ProcessSettings;
 use rustix::mm::{MlockAllFlags, mlockall};
 use rustix::process::{Resource, geteuid, getrlimit};
-use rustix::thread::{CpuSet, sched_setaffinity};
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 use thread_priority::{
     RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue, ThreadSchedulePolicy,
     set_thread_priority_and_policy, thread_native_id, thread_schedule_policy,
@@ -31,6 +31,12 @@ pub fn prepare(settings: &ProcessSettings, core: Option<usize>) -> Vec<String> {
         warnings.push(message.to_owned());
     }
     warnings
+}
+
+/// The cores this process may use; none when the operating system does not say.
+pub fn available_cores() -> Vec<usize> {
+    let Ok(cores) = sched_getaffinity(None) else { return Vec::new() };
+    (0..CpuSet::MAX_CPU).filter(|core| cores.is_set(*core)).collect()
 }
 
 /// Binds the calling thread to a core; says whether that succeeded.

@@ -2,10 +2,13 @@
 
 use delmpc_messages::{ProcessState, Role};
 use delmpc_transport::{LinkError, RunId, RunNode};
-use rustix::process::{Signal, set_parent_process_death_signal};
+use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
 
 use crate::presence::{Peer, Presence};
 use crate::stop::StopFlag;
+
+/// Silence after which it is worth asking whether a peer's process is still there, s.
+const LOOK_FOR_PEER_S: f64 = 0.1;
 
 /// What a process is to do now.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -74,11 +77,14 @@ pub struct Membership {
     /// The controller to the plant and the plant to the controller.
     peer: Peer,
     stop: StopFlag,
-    hang_s: f64,
+    /// The process that started a supervised one.
+    parent: Option<Pid>,
+    hang_s: Option<f64>,
 }
 
 impl Membership {
-    /// Joins a run. A supervised process follows its supervisor's heartbeat; one on its own runs at once and ends by a signal.
+    /// Joins a run. A supervised process follows its supervisor's heartbeat; one on its own runs at once and ends by a signal. A peer that
+    /// is silent for `hang_s` is lost; without a limit, and while it starts, only one whose process is gone.
     ///
     /// # Errors
     /// When shared memory is unusable, or a living process already plays this role in this run.
@@ -87,7 +93,7 @@ impl Membership {
         joint_set_hash: u64,
         role: Role,
         supervised: bool,
-        hang_s: f64,
+        hang_s: Option<f64>,
     ) -> Result<Self, LinkError> {
         let stop = if supervised { StopFlag::on_termination_only() } else { StopFlag::on_signals() };
         // Without handlers a signal ends the process at once, and the supervisor tidies up.
@@ -101,7 +107,20 @@ impl Membership {
         let supervisor = if supervised { Some(Peer::new(&node, Role::Supervisor)?) } else { None };
         let other = if role == Role::Plant { Role::Controller } else { Role::Plant };
         let peer = Peer::new(&node, other)?;
-        Ok(Self { node, presence, supervisor, peer, stop, hang_s })
+        let parent = supervised.then(getppid).flatten();
+        Ok(Self { node, presence, supervisor, peer, stop, parent, hang_s })
+    }
+
+    /// Whether the other process was there and is gone.
+    fn peer_is_lost(&self) -> bool {
+        let (Some(state), silent_s) = (self.peer.state(), self.peer.silent_s()) else { return false };
+        if self.peer_is_done() || silent_s < LOOK_FOR_PEER_S {
+            return false;
+        }
+        match self.hang_s.filter(|_| state != ProcessState::Starting) {
+            Some(hang_s) => silent_s > hang_s,
+            None => self.peer.is_gone(),
+        }
     }
 
     /// The run's shared memory.
@@ -123,15 +142,16 @@ impl Attendance for Membership {
                 supervisor.listen()?;
                 match supervisor.state() {
                     Some(ProcessState::Stopping) => Order::Stop,
-                    Some(_) if supervisor.silent_s() > self.hang_s => Order::SupervisorLost,
+                    // A supervisor that the machine keeps from its core is silent too.
+                    _ if getppid() != self.parent => Order::SupervisorLost,
                     Some(ProcessState::Running) => Order::Run,
                     _ => Order::Wait,
                 }
             }
         };
         // A supervisor sees sooner and more, and says why.
-        let lost = self.peer.state().is_some() && !self.peer_is_done() && self.peer.silent_s() > self.hang_s;
-        Ok(if lost && !order.ends() && self.supervisor.is_none() { Order::PeerLost } else { order })
+        let lost = self.supervisor.is_none() && !order.ends() && self.peer_is_lost();
+        Ok(if lost { Order::PeerLost } else { order })
     }
 
     fn announce(&mut self, state: ProcessState) -> Result<(), LinkError> {

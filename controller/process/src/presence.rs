@@ -5,6 +5,9 @@ use delmpc_transport::{
     Channel, LinkError, Publisher, RunNode, SharedPublisher, SharedSubscriber, Subscriber,
 };
 
+use rustix::io::Errno;
+use rustix::process::{Pid, test_kill_process};
+
 use crate::clock::monotonic_ns;
 
 /// Time between signs of life.
@@ -110,6 +113,12 @@ impl Peer {
     /// The state it announced last, if it was ever heard.
     pub fn state(&self) -> Option<ProcessState> {
         self.latest.and_then(|heartbeat| heartbeat.state())
+    }
+
+    /// Whether its process has ended: then it says nothing any more.
+    pub fn is_gone(&self) -> bool {
+        let pid = self.pid().and_then(|pid| i32::try_from(pid).ok()).and_then(Pid::from_raw);
+        pid.is_some_and(|pid| test_kill_process(pid) == Err(Errno::SRCH))
     }
 
     /// Its process id, if it was ever heard.

@@ -4,7 +4,7 @@ use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 use signal_hook::flag::register;
 
 /// Set by SIGINT, SIGTERM or SIGHUP.
@@ -35,6 +35,12 @@ impl StopFlag {
             register(signal, Arc::default())?;
         }
         Ok(flag)
+    }
+
+    /// Makes a write beyond the largest file allowed an error like any other, instead of the end of the process. Without handlers it stays
+    /// that.
+    pub fn outlive_file_limits() {
+        let _ = register(SIGXFSZ, Arc::default());
     }
 
     /// A flag that nothing sets.

@@ -3,6 +3,7 @@
 use alloc::vec;
 use alloc::vec::Vec;
 
+use crate::errors::StepError;
 use crate::spatial::RigidTransform;
 use crate::tree::KinematicTree;
 
@@ -40,5 +41,25 @@ impl State {
         self.base_pose = other.base_pose;
         self.q.copy_from_slice(&other.q);
         self.p.copy_from_slice(&other.p);
+    }
+
+    /// Refuses a state with a number that is NaN or infinite. O(n), no allocation.
+    ///
+    /// # Errors
+    /// [`StepError::NonFinite`] naming the first one.
+    pub fn check_finite(&self) -> Result<(), StepError> {
+        let pose = &self.base_pose;
+        let parts: [(&'static str, &[f64]); 4] = [
+            ("joint coordinate", &self.q),
+            ("momentum", &self.p),
+            ("base rotation", pose.rotation.as_slice()),
+            ("base position", pose.translation.as_slice()),
+        ];
+        for (quantity, values) in parts {
+            if let Some(index) = values.iter().position(|x| !x.is_finite()) {
+                return Err(StepError::NonFinite { quantity, index });
+            }
+        }
+        Ok(())
     }
 }

@@ -300,6 +300,8 @@ impl Integrator {
         let count = self.del.unknown_nodes() + 1;
         self.del.next_state_into(tree, &mut self.next);
         self.add_residual_to_momentum(tree);
+        // The equations may hold at nodes whose momenta overflow.
+        self.next.check_finite()?;
         for dof in 0..tree.dof() {
             for alpha in 0..count {
                 self.previous_nodes[dof * count + alpha] = self.del.node(alpha, dof);

@@ -1,6 +1,6 @@
 //! The checks messages share. Each names the field it refuses.
 
-use crate::{MAX_JOINTS, MessageError};
+use crate::{LATEST_TIME_NS, MAX_JOINTS, MessageError};
 
 /// A quaternion whose squared length differs more than this from 1 was not normalised.
 const UNIT_TOLERANCE: f64 = 1e-6;
@@ -31,6 +31,15 @@ pub(crate) fn plausible_one(
     }
     if value.abs() > limit {
         return Err(MessageError::Implausible { message, field, index, value, limit });
+    }
+    Ok(())
+}
+
+/// A time that a clock may show.
+pub(crate) fn time(message: &'static str, field: &'static str, time_ns: u64) -> Result<(), MessageError> {
+    let limit_ns = LATEST_TIME_NS;
+    if time_ns > limit_ns {
+        return Err(MessageError::TimeBeyond { message, field, time_ns, limit_ns });
     }
     Ok(())
 }

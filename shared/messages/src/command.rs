@@ -6,8 +6,8 @@ use iceoryx2::prelude::ZeroCopySend;
 
 use crate::header::message;
 use crate::{
-    ConstraintKind, CycleReport, Header, LARGEST_COORDINATE, LARGEST_EFFORT, MAX_FEET, MAX_JOINTS,
-    MAX_RATE_SAMPLES, Message, MessageError, check,
+    ConstraintKind, CycleReport, Header, LARGEST_COORDINATE, LARGEST_EFFORT, LONGEST_VALIDITY_NS, MAX_FEET,
+    MAX_JOINTS, MAX_RATE_SAMPLES, Message, MessageError, check,
 };
 
 /// Capacity for the segments of a [`Command`].
@@ -253,10 +253,7 @@ impl Command {
         let n = check::joint_count(message, self.n_joints, n_joints)?;
         check::known(message, "verdict", self.verdict, self.verdict())?;
         check::known(message, "fallback_level", self.fallback_level, self.fallback_level())?;
-        if self.valid_from_ns > self.valid_until_ns {
-            let (from_ns, until_ns) = (self.valid_from_ns, self.valid_until_ns);
-            return Err(MessageError::EmptyInterval { message, from_ns, until_ns });
-        }
+        self.validate_times()?;
 
         let count = self.n_segments as usize;
         if !(1..=MAX_SEGMENTS).contains(&count) {
@@ -271,7 +268,7 @@ impl Command {
             if begin_ns < earliest_ns || (index == 0 && begin_ns != 0) {
                 return Err(MessageError::SegmentOutOfOrder { message, index, begin_ns, earliest_ns });
             }
-            earliest_ns = begin_ns + 1;
+            earliest_ns = begin_ns.saturating_add(1);
             segment.validate(index, n)?;
         }
         for (row, gain) in self.gain[..n].iter().enumerate() {
@@ -308,6 +305,25 @@ impl Command {
         check::plausible(message, "report.worst_violation", &[report.worst_violation], f64::MAX)?;
         let kind: Option<ConstraintKind> = report.worst_constraint();
         check::known(message, "report.worst_constraint", report.worst_constraint, kind)?;
+        Ok(())
+    }
+
+    /// Times that a clock shows, and a time span that is neither empty nor for ever.
+    fn validate_times(&self) -> Result<(), MessageError> {
+        let message = Self::NAME;
+        let (from_ns, until_ns) = (self.valid_from_ns, self.valid_until_ns);
+        for (field, time_ns) in
+            [("state_time_ns", self.state_time_ns), ("valid_from_ns", from_ns), ("valid_until_ns", until_ns)]
+        {
+            check::time(message, field, time_ns)?;
+        }
+        if from_ns > until_ns {
+            return Err(MessageError::EmptyInterval { message, from_ns, until_ns });
+        }
+        let limit_ns = LONGEST_VALIDITY_NS;
+        if until_ns - from_ns > limit_ns {
+            return Err(MessageError::ValidTooLong { message, from_ns, until_ns, limit_ns });
+        }
         Ok(())
     }
 

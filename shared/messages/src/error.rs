@@ -145,6 +145,44 @@ pub enum MessageError {
         /// End of the interval.
         until_ns: u64,
     },
+    /// A time no clock shows.
+    #[error("{message}: {field} = {time_ns} ns is beyond {limit_ns} ns; look at the clock of the sender")]
+    TimeBeyond {
+        /// The refused message.
+        message: &'static str,
+        /// The field.
+        field: &'static str,
+        /// The time.
+        time_ns: u64,
+        /// The latest time accepted.
+        limit_ns: u64,
+    },
+    /// A command that would be valid for too long.
+    #[error(
+        "{message}: valid from {from_ns} ns until {until_ns} ns, longer than {limit_ns} ns; shorten the life of commands"
+    )]
+    ValidTooLong {
+        /// The refused message.
+        message: &'static str,
+        /// Begin of the interval.
+        from_ns: u64,
+        /// End of the interval.
+        until_ns: u64,
+        /// The longest time accepted.
+        limit_ns: u64,
+    },
+    /// The message belongs to another run.
+    #[error(
+        "{message}: of run {found:016x}, this is run {expected:016x}; give both processes the same run id and seed"
+    )]
+    WrongRun {
+        /// The expected message.
+        message: &'static str,
+        /// The run in the message.
+        found: u64,
+        /// Our run.
+        expected: u64,
+    },
     /// Bounds with nothing between them.
     #[error(
         "{message}: torque_lower[{index}] = {lower:e} is above torque_upper[{index}] = {upper:e}; look at the sender, nothing was \
@@ -203,7 +241,10 @@ impl MessageError {
             Self::EmptyBounds { .. } => 11,
             Self::WrongSegmentCount { .. } => 12,
             Self::SegmentOutOfOrder { .. } => 13,
-            Self::TooManyFeet { .. } => 14,
+            Self::TimeBeyond { .. } => 14,
+            Self::ValidTooLong { .. } => 15,
+            Self::WrongRun { .. } => 16,
+            Self::TooManyFeet { .. } => 17,
         }
     }
 }

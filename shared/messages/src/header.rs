@@ -55,6 +55,17 @@ impl Header {
         }
         Ok(())
     }
+
+    /// Checks that a header belongs to a run. Whoever is in a run checks it beside [`Self::validate`].
+    ///
+    /// # Errors
+    /// [`MessageError::WrongRun`].
+    pub fn validate_run<M: Message>(&self, expected_run_id: u64) -> Result<(), MessageError> {
+        if self.run_id == expected_run_id {
+            return Ok(());
+        }
+        Err(MessageError::WrongRun { message: M::NAME, found: self.run_id, expected: expected_run_id })
+    }
 }
 
 /// A payload type: fixed size, plain data, with a [`Header`] first.

@@ -49,5 +49,11 @@ pub const MAX_JOINTS: usize = 32;
 /// Largest joint position, joint velocity or base coordinate taken for real (rad, m, rad/s, m/s).
 pub const LARGEST_COORDINATE: f64 = 1e5;
 
+/// Latest time taken for real (ns): 146 years. Sums of two times then fit into 64 bits.
+pub const LATEST_TIME_NS: u64 = 1 << 62;
+
+/// Longest time a command may be valid (ns). A plant that holds the command of a controller that is gone holds it no longer.
+pub const LONGEST_VALIDITY_NS: u64 = 20_000_000_000;
+
 /// Largest torque, force or feedback gain taken for real (N m, N, and those per rad, m, rad/s, m/s).
 pub const LARGEST_EFFORT: f64 = 1e9;

@@ -155,8 +155,9 @@ impl PlantState {
         }
     }
 
-    /// Checks everything that can be checked without knowing the past: type, version, joint set and count, codes, every number
-    /// of a sensor that is there finite and plausible, the quaternion of unit length. Freshness is the receiver's business: it knows the last sequence and time.
+    /// Checks everything that can be checked without knowing the past: type, version, joint set and count, time, codes, every number of a
+    /// sensor that is there finite and plausible, the quaternion of unit length. Freshness is the receiver's business: it knows the last
+    /// sequence and time.
     ///
     /// Cost: O(n), no allocation.
     ///
@@ -165,6 +166,7 @@ impl PlantState {
     pub fn validate(&self, expected_joint_set_hash: u64, n_joints: usize) -> Result<(), MessageError> {
         self.header.validate::<Self>(expected_joint_set_hash)?;
         let n = check::joint_count(Self::NAME, self.n_joints, n_joints)?;
+        check::time(Self::NAME, "time_ns", self.time_ns)?;
         check::known(Self::NAME, "clock", self.clock, ClockKind::from_code(self.clock))?;
         let level = FallbackLevel::from_code(self.watchdog_level);
         check::known(Self::NAME, "watchdog_level", self.watchdog_level, level)?;

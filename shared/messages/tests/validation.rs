@@ -3,9 +3,9 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // helpers of tests, too
 
 use delmpc_messages::{
-    ClockKind, Command, ConstraintKind, FallbackLevel, FootReading, Heartbeat, MAX_FEET, MAX_JOINTS, Message,
-    MessageError, PlantState, ProcessState, RateMean, Role, Segment, ServoReadings, Verdict, foot,
-    joint_set_hash, sensor, status,
+    ClockKind, Command, ConstraintKind, FallbackLevel, FootReading, Heartbeat, LATEST_TIME_NS,
+    LONGEST_VALIDITY_NS, MAX_FEET, MAX_JOINTS, Message, MessageError, PlantState, ProcessState, RateMean, Role,
+    Segment, ServoReadings, Verdict, foot, joint_set_hash, sensor, status,
 };
 
 const N: usize = 3;
@@ -474,4 +474,53 @@ fn codes_of_refusals_are_never_zero() {
     assert_eq!(state_error(|s| s.header.magic = 0).code(), 1);
     assert_eq!(state_error(|s| s.position[0] = f64::NAN).code(), 5);
     assert_eq!(state_error(|s| s.position[0] = 1e300).code(), 6);
+}
+
+#[test]
+fn times_at_the_end_of_all_numbers_and_lives_without_end_are_refused() {
+    let beyond = LATEST_TIME_NS + 1;
+    for (change, field) in [
+        ((|c, t| c.state_time_ns = t) as fn(&mut Command, u64), "state_time_ns"),
+        (|c, t| (c.valid_from_ns, c.valid_until_ns) = (t, t), "valid_from_ns"),
+        (|c, t| c.valid_until_ns = t, "valid_until_ns"),
+    ] {
+        for time_ns in [beyond, u64::MAX] {
+            let error = command_error(|c| change(c, time_ns));
+            let limit_ns = LATEST_TIME_NS;
+            assert_eq!(error, MessageError::TimeBeyond { message: Command::NAME, field, time_ns, limit_ns });
+        }
+    }
+    let limit_ns = LONGEST_VALIDITY_NS;
+    let error = command_error(|c| c.valid_until_ns = c.valid_from_ns + limit_ns + 1);
+    assert!(matches!(error, MessageError::ValidTooLong { .. }), "{error}");
+    let mut command = command();
+    command.valid_until_ns = command.valid_from_ns + limit_ns;
+    command.validate(HASH, N).unwrap();
+
+    let mut state = state();
+    state.time_ns = u64::MAX;
+    assert!(matches!(state.validate(HASH, N), Err(MessageError::TimeBeyond { field: "time_ns", .. })));
+}
+
+#[test]
+fn a_segment_at_the_end_of_all_times_is_out_of_order_or_never_in_force() {
+    let error = command_error(|c| {
+        c.n_segments = 3;
+        (c.segments[1].begin_ns, c.segments[2].begin_ns) = (u64::MAX, u64::MAX - 1);
+    });
+    assert!(matches!(error, MessageError::SegmentOutOfOrder { index: 2, .. }), "{error}");
+    let mut command = command();
+    (command.n_segments, command.segments[1].begin_ns) = (2, u64::MAX);
+    command.validate(HASH, N).unwrap();
+    assert_eq!(command.segment_at(u64::MAX).0.begin_ns, 0);
+}
+
+#[test]
+fn messages_of_another_run_are_told_apart() {
+    let state = state();
+    let run = state.header.run_id;
+    state.header.validate_run::<PlantState>(run).unwrap();
+    let error = state.header.validate_run::<PlantState>(run + 1).unwrap_err();
+    let message = PlantState::NAME;
+    assert_eq!(error, MessageError::WrongRun { message, found: run, expected: run + 1 });
 }

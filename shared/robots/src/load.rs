@@ -146,11 +146,11 @@ fn check_size(path: &Path, size: usize, limit: usize) -> Result<(), RobotError> 
 fn read(path: &Path, limit: usize) -> Result<String, RobotError> {
     let refuse = |rule| RobotError::new(path, None, Subject::File, rule);
     let unreadable = |error: std::io::Error| refuse(Rule::Unreadable(error.to_string()));
-    let file = File::open(path).map_err(unreadable)?;
-    // A device or pipe could block or never end.
-    if !file.metadata().map_err(unreadable)?.is_file() {
+    // A device or pipe could block, in opening it already, or never end.
+    if !std::fs::metadata(path).map_err(unreadable)?.is_file() {
         return Err(refuse(Rule::Unreadable("not a regular file".to_owned())));
     }
+    let file = File::open(path).map_err(unreadable)?;
     let mut bytes = Vec::new();
     file.take(limit as u64 + 1).read_to_end(&mut bytes).map_err(unreadable)?;
     check_size(path, bytes.len(), limit)?;

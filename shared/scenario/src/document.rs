@@ -26,6 +26,7 @@ pub struct Document {
     table: Table,
     places: BTreeMap<String, Place>,
     catalogue: Value,
+    notes: Vec<String>,
 }
 
 impl Document {
@@ -65,8 +66,13 @@ impl Document {
         };
         let spanned = DeTable::parse(text).map_err(syntax)?;
         let catalogue = Value::try_from(Scenario::catalogue()).unwrap_or(Value::Table(Table::new()));
-        let mut document =
-            Self { file: file.to_owned(), table: Table::new(), places: BTreeMap::new(), catalogue };
+        let mut document = Self {
+            file: file.to_owned(),
+            table: Table::new(),
+            places: BTreeMap::new(),
+            catalogue,
+            notes: Vec::new(),
+        };
         document.note_places("", spanned.get_ref(), text);
         let table: Table = toml::from_str(text).map_err(syntax)?;
         document.table =
@@ -74,11 +80,12 @@ impl Document {
         Ok(document)
     }
 
-    /// Overrides a key: `key=value`, with the value as in TOML; strings may go without quotes. `push.…` means the first push,
-    /// `fault.…` the first fault.
+    /// Overrides a key: `key=value`, with the value as in TOML; strings may go without quotes. One of a list is named as in messages:
+    /// `push[1].impulse_ns`, counted from 0. `push.…` means the first push, `fault.…` the first fault.
     ///
     /// # Errors
-    /// [`ScenarioError::MalformedOverride`], [`ScenarioError::UnknownKey`], [`ScenarioError::WrongType`].
+    /// [`ScenarioError::MalformedOverride`], [`ScenarioError::UnknownKey`], [`ScenarioError::WrongType`],
+    /// [`ScenarioError::NoSuchEntry`].
     pub fn set(&mut self, text: &str) -> Result<(), ScenarioError> {
         let malformed = || ScenarioError::MalformedOverride { text: text.to_owned() };
         let (key, value) = text.split_once('=').ok_or_else(malformed)?;
@@ -92,6 +99,19 @@ impl Document {
             .filter(|table| table.len() == 1)
             .and_then(|mut table| table.remove("value"))
             .unwrap_or_else(bare);
+        if let Some((list, index, name)) = entry(key) {
+            return self.set_entry(text, list, index, name, value);
+        }
+        for list in LISTS {
+            let entries = self.table.get(list).and_then(Value::as_array).map_or(0, Vec::len);
+            if entries > 1 && key.strip_prefix(list).is_some_and(|rest| rest.starts_with('.')) {
+                let name = &key[list.len()..];
+                let last = entries - 1;
+                self.notes.push(format!(
+                    "--set {key}: there are {entries}, and it changes the first one: name {list}[0]{name} .. {list}[{last}]{name}"
+                ));
+            }
+        }
         // Checked as if it were alone in a file, then put into ours.
         let mut wrapped = value;
         for part in key.rsplit('.') {
@@ -109,6 +129,55 @@ impl Document {
             merge(&mut self.table, changes);
         }
         Ok(())
+    }
+
+    /// Overrides a key of one entry of a list.
+    fn set_entry(
+        &mut self,
+        text: &str,
+        list: &str,
+        index: usize,
+        name: &str,
+        value: Value,
+    ) -> Result<(), ScenarioError> {
+        let key = format!("{list}[{index}]");
+        let mut wrapped = value;
+        for part in name.rsplit('.') {
+            wrapped = Value::Table(Table::from_iter([(part.to_owned(), wrapped)]));
+        }
+        self.places.insert(format!("{key}.{name}"), Place::Override(text.to_owned()));
+        if let (0, Some(Value::Table(_))) = (index, self.table.get(list)) {
+            self.places.insert(format!("{list}.{name}"), Place::Override(text.to_owned()));
+        }
+        let pattern = self.catalogue.get(list).cloned().unwrap_or(Value::Table(Table::new()));
+        let typed = self.typed(&key, wrapped, &pattern)?;
+        let entries = match self.table.get(list) {
+            Some(Value::Array(entries)) => entries.len(),
+            Some(_) => 1,
+            None => 0,
+        };
+        let place = match self.table.get_mut(list) {
+            Some(Value::Array(entries)) => entries.get_mut(index),
+            Some(only) if index == 0 => Some(only),
+            _ => None,
+        };
+        match (place, typed) {
+            (Some(Value::Table(old)), Value::Table(change)) => {
+                merge(old, change);
+                Ok(())
+            }
+            _ => Err(ScenarioError::NoSuchEntry {
+                file: self.file.clone(),
+                text: text.to_owned(),
+                list: list.to_owned(),
+                entries,
+            }),
+        }
+    }
+
+    /// What should be known of the overrides so far.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
     }
 
     /// The scenario, with defaults filled in and all ranges checked.
@@ -242,6 +311,14 @@ impl Scenario {
         let body = toml::to_string(self).unwrap_or_default();
         format!("# Effective configuration: every key with the value that was used.\n{body}")
     }
+}
+
+/// List, index and name of `list[index].name`.
+fn entry(key: &str) -> Option<(&'static str, usize, &str)> {
+    LISTS.into_iter().find_map(|list| {
+        let (index, name) = key.strip_prefix(list)?.strip_prefix('[')?.split_once("].")?;
+        Some((list, index.parse().ok()?, name))
+    })
 }
 
 /// Puts `changes` into `table`; where `table` has a list of tables and `changes` one table, into the first of the list.

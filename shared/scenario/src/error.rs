@@ -91,6 +91,20 @@ pub enum ScenarioError {
         /// What to do.
         remedy: String,
     },
+    /// An override of an entry that is not in its list.
+    #[error(
+        "{file}: --set {text}: there are {entries} of `{list}`, counted from 0: write the others into the file"
+    )]
+    NoSuchEntry {
+        /// The file.
+        file: String,
+        /// The override.
+        text: String,
+        /// The list.
+        list: String,
+        /// Entries it has.
+        entries: usize,
+    },
     /// An override that is not `key=value`.
     #[error(
         "--set {text}: not of the form key=value: write for example --set seed=7 or --set push.direction=[0,-1,0]"

@@ -17,9 +17,13 @@ const WHOLE_STEPS: f64 = 1e-6;
 /// Weights beyond this cannot be told from an infinite one in double precision.
 const LARGEST_WEIGHT: f64 = 1e9;
 
+/// Bytes of a name; with the time of the run it stays far below what file systems allow.
+const LONGEST_NAME: usize = 100;
+
 /// All rules, in the order of the keys; the first one broken.
 pub(crate) fn check(scenario: &Scenario) -> Result<(), Violation> {
     let Scenario { duration_s, robot, plant, sensors, controller, process, success, .. } = scenario;
+    check_name(&scenario.name)?;
     within("seed", scenario.seed as f64, 0.0, i64::MAX as f64)?;
     positive("duration_s", *duration_s, 3600.0)?;
     named("robot.urdf", &robot.urdf, "a URDF file, for example configs/robots/atlas.urdf")?;
@@ -179,6 +183,22 @@ fn check_ground(scenario: &Scenario) -> Result<(), Violation> {
         each(&key("max_m"), &gap.max_m, 1000.0)?;
     }
     Ok(())
+}
+
+/// A name becomes part of a folder's name.
+fn check_name(name: &str) -> Result<(), Violation> {
+    let unfit = |c: char| c == '/' || c == '\\' || c.is_control();
+    let rule = if name.chars().any(unfit) {
+        "a name has no slashes, backslashes or control characters: it becomes part of a path"
+    } else if name.starts_with('.') {
+        "a name does not begin with a dot: it becomes the name of a folder"
+    } else if name.len() > LONGEST_NAME {
+        "a name has at most 100 bytes: it becomes part of a file's name"
+    } else {
+        return Ok(());
+    };
+    let shown: String = name.chars().take(LONGEST_NAME).collect();
+    Err(violation("name", format!("{shown:?}"), rule, "take a word, such as \"stand\""))
 }
 
 fn check_fault(fault: &FaultSettings, index: usize, faults: usize) -> Result<(), Violation> {

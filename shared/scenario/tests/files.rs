@@ -296,3 +296,57 @@ fn thresholds_of_timing_have_ranges() {
     document.set("timing.max_misses=0").unwrap();
     assert_eq!(document.scenario().unwrap().timing.max_misses, Some(0));
 }
+
+#[test]
+fn one_of_a_list_is_named_in_overrides_as_in_messages() {
+    let text = "robot.urdf = \"r.urdf\"\n[[push]]\nlink = \"a\"\n[[push]]\nlink = \"b\"\nstart_s = 2\n";
+    let mut document = Document::parse("two.toml", text).unwrap();
+    document.set("push[1].impulse_ns=7").unwrap();
+    document.set("push[0].link=c").unwrap();
+    let scenario = document.scenario().unwrap();
+    let pushes: Vec<(&str, f64)> =
+        scenario.push.iter().map(|push| (push.link.as_str(), push.impulse_ns)).collect();
+    assert_eq!(pushes[1], ("b", 7.0));
+    assert_eq!(pushes[0].0, "c");
+    assert!(document.notes().is_empty());
+
+    let refused = |text: &str| document.clone().set(text).unwrap_err().to_string();
+    assert!(refused("push[2].impulse_ns=7").contains("there are 2 of `push`"));
+    assert!(refused("push[1].impulse=7").contains("push[1].impulse_ns"), "{}", refused("push[1].impulse=7"));
+    assert!(refused("push[1].impulse_ns=x").contains("push[1].impulse_ns"));
+    assert!(refused("push[x].impulse_ns=7").contains("unknown key"));
+    assert!(refused("fault[0].count=7").contains("there are 0 of `fault`"));
+    // The same name in the message about its value.
+    document.set("push[1].impulse_ns=1e6").unwrap();
+    let error = document.scenario().unwrap_err().to_string();
+    assert!(
+        error.contains("--set push[1].impulse_ns=1e6") && error.contains("`push[1].impulse_ns`"),
+        "{error}"
+    );
+    // Without an index it is the first one, and that is said.
+    document.set("push[1].impulse_ns=1").unwrap();
+    document.set("push.impulse_ns=3").unwrap();
+    assert_eq!(document.scenario().unwrap().push[0].impulse_ns, 3.0);
+    assert!(
+        document.notes()[0].contains("push[0].impulse_ns .. push[1].impulse_ns"),
+        "{:?}",
+        document.notes()
+    );
+
+    let mut single = Document::parse("one.toml", "robot.urdf = \"r.urdf\"\n[push]\nlink = \"a\"\n").unwrap();
+    single.set("push[0].impulse_ns=5").unwrap();
+    single.set("push.start_s=1").unwrap();
+    assert_eq!(single.scenario().unwrap().push[0].impulse_ns, 5.0);
+    assert!(single.notes().is_empty());
+}
+
+#[test]
+fn a_name_that_leads_elsewhere_is_refused() {
+    for name in ["../../evil", "a/b", "/tmp/x", "..", ".hidden", "a\\\\b", "a\\u001bb", &"x".repeat(101)] {
+        let text = format!("name = \"{name}\"\nrobot.urdf = \"r.urdf\"\n");
+        let error = Document::parse("a.toml", &text).unwrap().scenario().unwrap_err().to_string();
+        assert!(error.contains("`name`"), "{error}");
+    }
+    let text = "name = \"Füße 2-b_c.d\"\nrobot.urdf = \"r.urdf\"\n";
+    Document::parse("a.toml", text).unwrap().scenario().unwrap();
+}

@@ -4,6 +4,7 @@
 //! is old and not finished has lost its maker. Finished files of dead processes are not touched here: iceoryx2 removes those by itself.
 
 use std::fs::{self, Metadata};
+use std::os::fd::AsFd;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -11,6 +12,7 @@ use std::thread;
 use std::time::Duration;
 
 use crate::RunId;
+use crate::sweep::{is_our_file, open_folder};
 
 /// Where Linux keeps named shared memory. Elsewhere there is no such folder, and nothing is found in it.
 pub(crate) const SHARED_MEMORY: &str = "/dev/shm";
@@ -61,7 +63,8 @@ impl Drop for Dismiss<'_, '_> {
 /// Removes the half-made files of a run whose makers are lost.
 fn remove_abandoned(run: RunId) {
     let memory = shared_memory_files(&run.prefix()).into_iter();
-    let services = files(&run.root_path().join("services")).into_iter();
+    let root = run.root_path().map(|root| files(&root.join("services"))).unwrap_or_default();
+    let services = root.into_iter();
     let unfinished_memory = memory.filter(|path| is_lost(path, |mode| mode & OWNER_MAY_READ == 0));
     let unfinished_services = services.filter(|path| is_lost(path, |mode| mode & OWNER_MAY_WRITE != 0));
     for path in unfinished_memory.chain(unfinished_services) {
@@ -69,12 +72,14 @@ fn remove_abandoned(run: RunId) {
     }
 }
 
-/// The files in shared memory whose name begins with `prefix`.
+/// The plain files of this user in shared memory whose name begins with `prefix`. What others have put there is not ours to open or remove.
 pub(crate) fn shared_memory_files(prefix: &str) -> Vec<PathBuf> {
-    let begins = |path: &PathBuf| {
-        path.file_name().is_some_and(|n| n.as_encoded_bytes().starts_with(prefix.as_bytes()))
+    let Ok(Some(folder)) = open_folder(Path::new(SHARED_MEMORY)) else { return Vec::new() };
+    let ours = |path: &PathBuf| {
+        let name = path.file_name().and_then(|name| name.to_str());
+        name.is_some_and(|name| name.starts_with(prefix) && is_our_file(folder.as_fd(), name))
     };
-    files(Path::new(SHARED_MEMORY)).into_iter().filter(begins).collect()
+    files(Path::new(SHARED_MEMORY)).into_iter().filter(ours).collect()
 }
 
 /// What a folder contains; nothing when there is no such folder.
@@ -88,6 +93,6 @@ pub(crate) fn is_older_than(age: Duration, file: &Metadata) -> bool {
 }
 
 fn is_lost(path: &Path, unfinished: fn(u32) -> bool) -> bool {
-    let file = fs::metadata(path).ok().filter(Metadata::is_file);
+    let file = fs::symlink_metadata(path).ok().filter(Metadata::is_file);
     file.is_some_and(|file| unfinished(file.permissions().mode()) && is_older_than(LOST, &file))
 }

@@ -18,6 +18,34 @@ pub enum LinkError {
         /// The text.
         text: String,
     },
+    /// The operating system gave no random numbers.
+    #[error("no random numbers for a run id: /dev/urandom: {source}")]
+    NoRandomness {
+        /// The cause.
+        source: io::Error,
+    },
+    /// The folder for the service files of all runs is not this user's alone.
+    #[error(
+        "{}: this folder has to be private, and {what}: remove it, or name another one in XDG_RUNTIME_DIR (a folder of yours of mode 0700)",
+        folder.display()
+    )]
+    NotPrivate {
+        /// The folder.
+        folder: PathBuf,
+        /// What is wrong with it.
+        what: String,
+    },
+    /// The folder for the service files of all runs cannot be made or read.
+    #[error(
+        "{}: cannot keep the service files of runs there ({source}): set TMPDIR or XDG_RUNTIME_DIR to a folder of yours",
+        folder.display()
+    )]
+    NoRuntimeFolder {
+        /// The folder.
+        folder: PathBuf,
+        /// The cause.
+        source: io::Error,
+    },
     /// The shared memory of the run could not be entered.
     #[error(
         "run {run}: shared memory is not available ({source:?}): /dev/shm and {} must be writable for this user",
@@ -30,6 +58,18 @@ pub enum LinkError {
         root: PathBuf,
         /// The cause.
         source: NodeCreationFailure,
+    },
+    /// Shared memory is too short for a run.
+    #[error(
+        "/dev/shm has {} KiB left, {} KiB are needed: make it larger (for a container: --shm-size=64m) or remove what lies there",
+        free / 1024,
+        needed.div_ceil(1024)
+    )]
+    SharedMemoryFull {
+        /// Bytes left.
+        free: u64,
+        /// Bytes needed.
+        needed: u64,
     },
     /// The peer works with other joints, or the same joints in another order.
     #[error(

@@ -5,9 +5,14 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::io::{self, ErrorKind};
+use std::io;
+use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use iceoryx2::node::{DeadNodeView, Node, NodeListFailure, NodeState, NodeView};
 use iceoryx2::prelude::{CallbackProgression, LogLevel, ipc, set_log_level};
@@ -15,47 +20,107 @@ use iceoryx2::prelude::{CallbackProgression, LogLevel, ipc, set_log_level};
 use crate::abandoned::{
     SHARED_MEMORY, files, is_older_than, shared_memory_files, without_waiting_for_the_lost,
 };
+use crate::private_root::runtime_folder;
 use crate::run_node::config_of;
+use crate::sweep::{open_folder, remove_all, remove_strange};
 use crate::{LinkError, RunId};
 
 /// A run with a younger file may be about to start.
 const YOUNG: Duration = Duration::from_secs(10);
 /// Another process may be cleaning up the same dead one; wait that long for it.
 const CLEANUP_PATIENCE: Duration = Duration::from_secs(1);
+/// How often the caller is asked whether to go on.
+const LOOK: Duration = Duration::from_millis(20);
 
-/// Removes everything a run has left in shared memory and in the folder for temporary files. Call it when all processes of the run have
+/// Removes everything a run has left in shared memory and in the user's private folder. Call it when all processes of the run have
 /// ended and this process has dropped its own [`crate::RunNode`], publishers and subscribers. Returns the number of files removed; 0 when
-/// there was nothing.
+/// there was nothing. No link is followed, nothing of another user is touched.
 ///
 /// # Errors
 /// [`LinkError::StillInUse`] while a process of the run lives: then only what dead processes left is removed.
-/// [`LinkError::Leftover`] for a file that cannot be removed.
+/// [`LinkError::Leftover`] for a file that cannot be removed; [`LinkError::NotPrivate`], [`LinkError::NoRuntimeFolder`].
 pub fn remove_leftovers(run: RunId) -> Result<usize, LinkError> {
     set_log_level(LogLevel::Fatal);
-    let root = run.root_path();
-    if root.exists() {
+    let folder = runtime_folder()?;
+    let leftover = |path: &Path| {
+        let path = path.to_owned();
+        move |source: io::Error| LinkError::Leftover { run, path, source }
+    };
+    let root = run.root_path()?;
+    if let Some(opened) = open_folder(&root).map_err(leftover(&root))? {
+        remove_strange(opened.as_fd()).map_err(leftover(&root))?;
         without_waiting_for_the_lost(run, || bury_dead_processes(run))?;
     }
     let mut removed = 0;
-    for path in shared_memory_files(&run.prefix()) {
-        removed += usize::from(remove(run, &path, |path| fs::remove_file(path))?);
+    let shared_memory = Path::new(SHARED_MEMORY);
+    for (within, names) in
+        [(shared_memory, shared_memory_files(&run.prefix())), (&folder, vec![root.clone()])]
+    {
+        let Some(opened) = open_folder(within).map_err(leftover(within))? else { continue };
+        for path in names {
+            let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+            removed += remove_all(opened.as_fd(), name).map_err(leftover(&path))?;
+        }
     }
-    removed += count_files(&root);
-    remove(run, &root, |path| fs::remove_dir_all(path))?;
     Ok(removed)
 }
 
-/// Removes what earlier runs have left whose processes, the supervisor among them, were all killed. Runs that live, that may be about to
-/// start, or that belong to somebody else are not touched. Returns the runs removed.
-pub fn remove_dead_runs() -> Vec<RunId> {
-    let mut runs = BTreeSet::new();
-    for folder in [PathBuf::from(SHARED_MEMORY), std::env::temp_dir()] {
-        let names =
-            files(&folder).into_iter().filter_map(|path| path.file_name()?.to_str().map(str::to_owned));
-        runs.extend(names.filter_map(|name| RunId::of_file(&name)));
+/// Removes what may be in the place of a run's folder, or in it, and would lead elsewhere or block whoever opens it.
+pub(crate) fn clear_the_way(run: RunId) -> Result<(), LinkError> {
+    let (folder, root) = (runtime_folder()?, run.root_path()?);
+    let cleared = match open_folder(&root) {
+        Ok(Some(opened)) => remove_strange(opened.as_fd()),
+        Ok(None) => match open_folder(&folder) {
+            Ok(Some(opened)) => remove_all(opened.as_fd(), &run.to_string()).map(drop),
+            other => other.map(drop),
+        },
+        Err(error) => Err(error),
+    };
+    cleared.map_err(|source| LinkError::Leftover { run, path: root, source })
+}
+
+/// Removes what earlier runs of this user have left whose processes, the supervisor among them, were all killed. Runs that live or that
+/// may be about to start are not touched. Returns the runs removed.
+///
+/// It is a courtesy, so it ends after `patience`, or as soon as `stop` says so, even if a file system does not answer.
+pub fn remove_dead_runs(patience: Duration, stop: impl Fn() -> bool) -> Vec<RunId> {
+    let until = Instant::now() + patience;
+    let cancelled = Arc::new(AtomicBool::new(false));
+    let (tell, told) = channel();
+    let seen_by_worker = cancelled.clone();
+    // Not joined: it may never come back.
+    let worker = thread::Builder::new().spawn(move || {
+        for run in known_runs() {
+            if seen_by_worker.load(Ordering::Relaxed) {
+                return;
+            }
+            if !is_young(run) && remove_leftovers(run).is_ok() && tell.send(run).is_err() {
+                return;
+            }
+        }
+    });
+    let mut removed = Vec::new();
+    while worker.is_ok() && !stop() && Instant::now() < until {
+        match told.recv_timeout(LOOK) {
+            Ok(run) => removed.push(run),
+            Err(RecvTimeoutError::Timeout) => {}
+            Err(RecvTimeoutError::Disconnected) => break,
+        }
     }
-    runs.retain(|run| !is_young(*run) && remove_leftovers(*run).is_ok());
-    runs.into_iter().collect()
+    cancelled.store(true, Ordering::Relaxed);
+    removed
+}
+
+/// Every run of which there is anything.
+fn known_runs() -> BTreeSet<RunId> {
+    let name = |path: PathBuf| path.file_name()?.to_str().map(str::to_owned);
+    let folders = runtime_folder().map(|folder| files(&folder)).unwrap_or_default();
+    let mut runs: BTreeSet<RunId> =
+        folders.into_iter().filter_map(name).filter_map(|name| name.parse().ok()).collect();
+    runs.extend(
+        shared_memory_files("").into_iter().filter_map(name).filter_map(|name| RunId::of_file(&name)),
+    );
+    runs
 }
 
 /// Removes the resources of killed processes; fails if one lives.
@@ -90,23 +155,10 @@ fn process_id(node: &impl NodeView) -> u32 {
     pid.and_then(|pid| u32::try_from(pid).ok()).unwrap_or(0)
 }
 
-fn count_files(folder: &Path) -> usize {
-    files(folder).into_iter().map(|path| if path.is_dir() { count_files(&path) } else { 1 }).sum()
-}
-
-/// Removes one file or folder; says whether it was there.
-fn remove(run: RunId, path: &Path, how: fn(&Path) -> io::Result<()>) -> Result<bool, LinkError> {
-    match how(path) {
-        Ok(()) => Ok(true),
-        Err(error) if error.kind() == ErrorKind::NotFound => Ok(false),
-        Err(source) => Err(LinkError::Leftover { run, path: path.to_owned(), source }),
-    }
-}
-
 /// Whether anything of the run was made or changed a moment ago.
 fn is_young(run: RunId) -> bool {
     let mut paths = shared_memory_files(&run.prefix());
-    paths.push(run.root_path());
-    let metadata = paths.into_iter().flat_map(fs::metadata);
+    paths.extend(run.root_path());
+    let metadata = paths.into_iter().flat_map(fs::symlink_metadata);
     metadata.into_iter().any(|file| !is_older_than(YOUNG, &file))
 }

@@ -4,9 +4,10 @@ use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-use crate::{LinkError, SplitMix64};
+use crate::LinkError;
+use crate::private_root::{random_number, runtime_folder, shared_number};
 
-/// All names in shared memory and all folders of ours begin with this.
+/// All names of ours in shared memory begin with this.
 const FAMILY: &str = "delmpc_";
 
 /// The identity of one run. Written as 16 hexadecimal digits.
@@ -14,7 +15,7 @@ const FAMILY: &str = "delmpc_";
 /// # Example
 /// ```
 /// use delmpc_transport::RunId;
-/// let run = RunId::from_seeds(1_700_000_000_000_000_000, 4711); // time and process id of the supervisor
+/// let run = RunId::random()?;
 /// assert_eq!(run.to_string().parse::<RunId>()?, run);
 /// # Ok::<(), delmpc_transport::LinkError>(())
 /// ```
@@ -22,10 +23,20 @@ const FAMILY: &str = "delmpc_";
 pub struct RunId(pub u64);
 
 impl RunId {
-    /// An identity mixed from two numbers that no two runs share as a pair, such as the time and the process id of the supervisor.
-    pub fn from_seeds(time_ns: u64, process_id: u32) -> Self {
-        let salt = SplitMix64::new(u64::from(process_id)).next_u64();
-        Self(SplitMix64::new(time_ns ^ salt).next_u64())
+    /// An identity nobody else has or can guess: names made of it cannot be taken beforehand.
+    ///
+    /// # Errors
+    /// [`LinkError::NoRandomness`] when the operating system has no random numbers.
+    pub fn random() -> Result<Self, LinkError> {
+        random_number().map(Self).map_err(|source| LinkError::NoRandomness { source })
+    }
+
+    /// The identity that all processes of this user make alike from a text, such as a scenario, and that other users cannot guess.
+    ///
+    /// # Errors
+    /// [`LinkError::NotPrivate`], [`LinkError::NoRuntimeFolder`] when the user's private folder is unusable.
+    pub fn of_text(text: &str) -> Result<Self, LinkError> {
+        shared_number(text).map(Self)
     }
 
     /// The beginning of every name this run has in shared memory.
@@ -33,12 +44,12 @@ impl RunId {
         format!("{FAMILY}{self}_")
     }
 
-    /// The folder in which this run keeps its service files.
-    pub(crate) fn root_path(self) -> PathBuf {
-        std::env::temp_dir().join(format!("{FAMILY}{self}"))
+    /// The folder in which this run keeps its service files, within the user's private folder.
+    pub(crate) fn root_path(self) -> Result<PathBuf, LinkError> {
+        Ok(runtime_folder()?.join(self.to_string()))
     }
 
-    /// The run a file or folder belongs to, if it is one of ours.
+    /// The run a file in shared memory belongs to, if it is one of ours.
     pub(crate) fn of_file(name: &str) -> Option<Self> {
         name.strip_prefix(FAMILY)?.get(..16)?.parse().ok()
     }
@@ -78,14 +89,15 @@ mod tests {
     fn it_recognises_its_own_files_only() {
         let run = RunId(0x12ab);
         assert_eq!(RunId::of_file(&format!("{}x.data", run.prefix())), Some(run));
-        assert_eq!(RunId::of_file(&run.root_path().file_name().unwrap().to_string_lossy()), Some(run));
         assert_eq!(RunId::of_file("delmpc_short"), None);
         assert_eq!(RunId::of_file("iox2_00000000000012ab"), None);
     }
 
     #[test]
-    fn runs_of_the_same_moment_or_process_differ() {
-        assert_ne!(RunId::from_seeds(1, 2), RunId::from_seeds(2, 1));
-        assert_ne!(RunId::from_seeds(1, 2), RunId::from_seeds(1, 3));
+    fn random_runs_differ_and_those_of_a_text_are_the_same() {
+        assert_ne!(RunId::random().unwrap(), RunId::random().unwrap());
+        let run = RunId::of_text("seed = 1").unwrap();
+        assert_eq!(RunId::of_text("seed = 1").unwrap(), run);
+        assert_ne!(RunId::of_text("seed = 2").unwrap(), run);
     }
 }

@@ -2,10 +2,10 @@
 
 use std::path::Path;
 use std::thread::sleep;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use iceoryx2::config::Config;
-use iceoryx2::node::{Node, NodeBuilder};
+use iceoryx2::node::{Node, NodeBuilder, NodeCreationFailure};
 use iceoryx2::port::publisher::PublisherCreateError;
 use iceoryx2::port::subscriber::SubscriberCreateError;
 use iceoryx2::prelude::{
@@ -20,6 +20,8 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use iceoryx2::service::static_config::messaging_pattern::MessagingPattern as StaticPattern;
 
 use crate::abandoned::without_waiting_for_the_lost;
+use crate::leftovers::clear_the_way;
+use crate::memory::{NEEDED, check_free, keep_to_ourselves, reserve};
 use crate::shared_link::MOST_BORROWED;
 use crate::{Channel, LinkError, Payload, RunId, SharedPublisher, SharedSubscriber};
 
@@ -30,9 +32,11 @@ const MAX_PROCESSES: usize = 16;
 const MAX_LOST_PUBLISHERS: usize = 2;
 /// The attribute of a channel that says which joints it is about.
 const JOINT_SET: &str = "joint_set_hash";
-/// A peer that is just being started, ended or cleaned up after a kill makes opening fail for a moment. All attempts together take longer
-/// than it takes until a half-made file counts as lost.
-const CONNECT_ATTEMPTS: u32 = 75;
+/// A peer that is just being started, ended or cleaned up after a kill makes opening fail for a moment; on a machine whose cores are all
+/// taken, for seconds. Longer than it takes until a half-made file counts as lost.
+const CONNECT_PATIENCE: Duration = Duration::from_secs(20);
+/// A place that is taken by a living process stays taken, and memory that cannot be had is not there a moment later.
+const PORT_PATIENCE: Duration = Duration::from_millis(1500);
 const CONNECT_PAUSE: Duration = Duration::from_millis(20);
 /// How long iceoryx2 itself waits for a peer that is just making the same channel.
 const CREATION_PATIENCE: Duration = Duration::from_millis(100);
@@ -52,26 +56,30 @@ impl RunNode {
     /// Enters a run. A process that loads no robot, like the supervisor, passes 0 for `joint_set_hash` and uses heartbeats only.
     ///
     /// # Errors
-    /// [`LinkError::NoSharedMemory`].
+    /// [`LinkError::NoSharedMemory`], [`LinkError::NotPrivate`], [`LinkError::NoRuntimeFolder`].
     pub fn open(run: RunId, joint_set_hash: u64) -> Result<Self, LinkError> {
         set_log_level(LogLevel::Fatal); // errors come back as values; standard error belongs to the process
         let config = config_of(run)?;
+        clear_the_way(run)?;
+        check_free(NEEDED)?;
         let create = || {
             let node = NodeBuilder::new().config(&config).signal_handling_mode(SignalHandlingMode::Disabled);
             node.create::<ipc::Service>()
         };
         let node = without_waiting_for_the_lost(run, || {
-            let mut node = create();
-            for _ in 1..CONNECT_ATTEMPTS {
-                if node.is_ok() {
-                    break;
+            let begin = Instant::now();
+            loop {
+                match create() {
+                    Err(NodeCreationFailure::InternalError) if begin.elapsed() < CONNECT_PATIENCE => {
+                        sleep(CONNECT_PAUSE);
+                    }
+                    made => break made,
                 }
-                sleep(CONNECT_PAUSE);
-                node = create();
             }
-            node
         });
-        let node = node.map_err(|source| LinkError::NoSharedMemory { run, root: run.root_path(), source })?;
+        let root = run.root_path()?;
+        let node = node.map_err(|source| LinkError::NoSharedMemory { run, root, source })?;
+        keep_to_ourselves(run);
         Ok(Self { node, run, joint_set_hash })
     }
 
@@ -79,17 +87,19 @@ impl RunNode {
     ///
     /// # Errors
     /// [`LinkError::JointSetMismatch`], [`LinkError::IncompatiblePayload`], [`LinkError::Occupied`] when the channel has a living
-    /// publisher, [`LinkError::Connect`].
+    /// publisher, [`LinkError::SharedMemoryFull`], [`LinkError::Connect`].
     pub fn publisher<T: Payload>(&self, channel: Channel) -> Result<SharedPublisher<T>, LinkError> {
         without_waiting_for_the_lost(self.run, || {
             let service = self.service::<T>(channel)?;
-            self.insist(|| match service.publisher_builder().create() {
+            let publisher = self.insist(PORT_PATIENCE, || match service.publisher_builder().create() {
                 Ok(port) => Attempt::Done(SharedPublisher::new(port, channel.name())),
                 Err(PublisherCreateError::ExceedsMaxSupportedPublishers) => {
                     Attempt::TryAgain(self.occupied(channel, "publisher"))
                 }
                 Err(other) => Attempt::TryAgain(self.refused(channel, &other)),
-            })
+            })?;
+            reserve(self.run)?;
+            Ok(publisher)
         })
     }
 
@@ -100,7 +110,7 @@ impl RunNode {
     pub fn subscriber<T: Payload>(&self, channel: Channel) -> Result<SharedSubscriber<T>, LinkError> {
         without_waiting_for_the_lost(self.run, || {
             let service = self.service::<T>(channel)?;
-            self.insist(|| match service.subscriber_builder().create() {
+            self.insist(PORT_PATIENCE, || match service.subscriber_builder().create() {
                 Ok(port) => Attempt::Done(SharedSubscriber::new(port, channel.name())),
                 Err(SubscriberCreateError::ExceedsMaxSupportedSubscribers) => {
                     Attempt::TryAgain(self.occupied(channel, "subscriber"))
@@ -119,7 +129,7 @@ impl RunNode {
     fn service<T: Payload>(&self, channel: Channel) -> Result<PortFactory<ipc::Service, T, ()>, LinkError> {
         let name = self.service_name(channel)?;
         let required = self.required_attributes(channel)?;
-        self.insist(|| {
+        self.insist(CONNECT_PATIENCE, || {
             let opened = self
                 .node
                 .service_builder(&name)
@@ -140,17 +150,16 @@ impl RunNode {
         })
     }
 
-    /// Tries until it is done, fails for good, or has been tried often enough; between attempts, what dead processes left is removed.
-    fn insist<R>(&self, attempt: impl Fn() -> Attempt<R>) -> Result<R, LinkError> {
-        let mut attempts = 1;
+    /// Tries until it is done, fails for good, or has been tried for long enough; between attempts, what dead processes left is removed.
+    fn insist<R>(&self, patience: Duration, attempt: impl Fn() -> Attempt<R>) -> Result<R, LinkError> {
+        let begin = Instant::now();
         loop {
             match attempt() {
                 Attempt::Done(result) => return Ok(result),
                 Attempt::Fail(error) => return Err(error),
-                Attempt::TryAgain(error) if attempts == CONNECT_ATTEMPTS => return Err(error),
+                Attempt::TryAgain(error) if begin.elapsed() > patience => return Err(error),
                 Attempt::TryAgain(_) => {}
             }
-            attempts += 1;
             self.node.try_cleanup_dead_nodes();
             sleep(CONNECT_PAUSE);
         }
@@ -263,7 +272,7 @@ pub(crate) fn config_of(run: RunId) -> Result<Config, LinkError> {
         channel: "all",
         reason: format!("{} cannot be part of a name in shared memory", what.display()),
     };
-    let (prefix, root) = (run.prefix(), run.root_path());
+    let (prefix, root) = (run.prefix(), run.root_path()?);
     let prefix_name = iceoryx2::prelude::FileName::new(prefix.as_bytes());
     config.global.prefix = prefix_name.map_err(|_| unusable(prefix.as_ref()))?;
     let root_name = iceoryx2::prelude::Path::new(root.as_os_str().as_encoded_bytes());

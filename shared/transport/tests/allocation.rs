@@ -61,7 +61,7 @@ fn the_counter_counts() {
 
 #[test]
 fn shared_memory() {
-    let run = RunId::from_seeds(0x0a11_0c47, std::process::id());
+    let run = RunId::random().unwrap();
     let node = RunNode::open(run, 2).unwrap();
     let mut states_out = node.publisher::<PlantState>(Channel::State).unwrap();
     let mut states_in = node.subscriber::<PlantState>(Channel::State).unwrap();

@@ -87,7 +87,7 @@ class Page {
     const notes = [
       `Frames every ${(1e3 * (run.frame_s ?? 0.01)).toFixed(0)} ms; torques, hand distance and the shaded band of the pressure point are the extremes between frames.`,
       `Arrows: ground reaction ${(REACTION * size).toFixed(2)} m for the robot's weight, push ${(0.1 * PUSH * size).toFixed(2)} m for a tenth of it. Dashed lines inside the sole: the margin the controller keeps.`,
-      run.damage ? `The log ends early: ${run.damage}` : null,
+      run.damage ? `The log is not whole: ${run.damage}` : null,
     ];
     $("notes").replaceChildren(...notes.filter(Boolean).map((note) => element("li", {}, note)));
     const legend = [["pressure", "pressure point and ground force"], ["capture", "capture point"], ["com", "mass centre"], ...(run.ball ? [["ball", "ball"]] : []), ["push", "push"]];

@@ -36,7 +36,7 @@ impl Controller {
     pub(super) fn write_command(&mut self, level: FallbackLevel, state: &PlantState, now_ns: u64) {
         let n = self.model.tree.dof();
         let mut start_ns = match self.last_state_ns {
-            Some(last) => now_ns.max(last + to_ns(self.config.delay_s)),
+            Some(last) => now_ns.max(last.saturating_add(to_ns(self.config.delay_s))),
             None => now_ns,
         };
         if level == FallbackLevel::FreshSolution && self.config.kind == ControllerKind::Mpc {
@@ -46,7 +46,7 @@ impl Controller {
         self.command.state_sequence = self.last_sequence.max(u64::from(self.last_state_ns.is_some()));
         self.command.state_time_ns = self.last_state_ns.unwrap_or(state.time_ns);
         self.command.valid_from_ns = start_ns;
-        self.command.valid_until_ns = start_ns + to_ns(self.config.command_life_s);
+        self.command.valid_until_ns = start_ns.saturating_add(to_ns(self.config.command_life_s));
         self.tell_estimate();
         for level in LEVELS.into_iter().filter(|candidate| *candidate >= level) {
             self.form_law(level, self.run_time_s(start_ns));

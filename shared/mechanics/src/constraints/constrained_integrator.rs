@@ -294,6 +294,7 @@ impl ConstrainedIntegrator {
         let jacobian = &self.jacobians[s * m * n..(s + 1) * m * n];
         self.projection.factor(tree, &mut self.velocities, &self.next, jacobian)?;
         self.projection.project_momentum(jacobian, &mut self.next.p);
+        self.next.check_finite()?;
         self.multipliers[s * m..].copy_from_slice(&self.projection.multiplier);
         self.apply_multipliers();
         self.del.evaluate(tree, forces.laws);

@@ -1,12 +1,11 @@
 //! A run of its own for each test, a watchdog, and messages.
 
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread::sleep;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use delmpc_messages::{Command, PlantState, joint_set_hash};
-use delmpc_transport::{Publisher, RunId, Subscriber, remove_leftovers};
+use delmpc_transport::{Publisher, RunId, Subscriber, remove_leftovers, runtime_folder};
 
 pub const HASH: u64 = joint_set_hash(&["hip", "knee", "ankle"]);
 pub const N: u32 = 3;
@@ -18,12 +17,8 @@ const WATCHDOG: Duration = Duration::from_secs(60);
 pub struct TestRun(pub RunId);
 
 impl TestRun {
-    #[allow(clippy::disallowed_methods, reason = "only to tell runs apart")]
     pub fn new() -> Self {
-        static COUNT: AtomicU64 = AtomicU64::new(0);
-        let time = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_nanos() as u64;
-        let count = COUNT.fetch_add(1, Ordering::Relaxed);
-        Self(RunId::from_seeds(time.wrapping_add(count << 48), std::process::id()))
+        Self(RunId::random().unwrap())
     }
 
     pub fn state(&self, sequence: u64) -> PlantState {
@@ -46,7 +41,7 @@ impl TestRun {
     pub fn files(&self) -> Vec<PathBuf> {
         let id = self.0.to_string();
         let mut files = Vec::new();
-        for folder in [PathBuf::from("/dev/shm"), std::env::temp_dir()] {
+        for folder in [PathBuf::from("/dev/shm"), runtime_folder().unwrap()] {
             for entry in std::fs::read_dir(folder).unwrap().flatten() {
                 if entry.file_name().to_string_lossy().contains(&id) {
                     files.push(entry.path());

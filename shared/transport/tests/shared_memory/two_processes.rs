@@ -195,7 +195,7 @@ fn dead_runs_are_removed_and_living_or_young_ones_are_not() {
     for file in dead.files().into_iter().chain(living.files()) {
         std::fs::File::open(file).unwrap().set_modified(long_ago).unwrap();
     }
-    let removed = remove_dead_runs();
+    let removed = remove_dead_runs(Duration::from_secs(30), || false);
     assert!(removed.contains(&dead.0));
     assert!(!removed.contains(&living.0) && !removed.contains(&young.0));
     assert_eq!(dead.files(), Vec::<PathBuf>::new());
