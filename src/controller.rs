@@ -48,7 +48,7 @@ fn warn_of_reach(scenario: &Scenario, out_of_reach_m: Option<f64>) {
     let allowed_m = scenario.success.hand_error_at_deadline_m;
     if let Some(distance_m) = out_of_reach_m.filter(|distance_m| *distance_m > allowed_m) {
         say(&format!(
-            "warning: no balanced posture brings the hand nearer to the ball than {distance_m:.3} m: move `reach.ball_m`"
+            "warning: no balanced posture brings the hand nearer to the ball than {distance_m:.3} m: it goes there; move `reach.ball_m`"
         ));
     }
 }

@@ -96,6 +96,9 @@ pub struct RobotFigures {
     pub hand_error_at_deadline_m: Option<f64>,
     /// Largest distance of hand and ball while holding.
     pub hand_error_hold_max_m: Option<f64>,
+    /// The least distance of hand and ball between deadline and end of the hold.
+    #[serde(default)]
+    pub hand_distance_left_m: Option<f64>,
     /// Whether it came to rest after the last push; nothing without a push.
     pub recovered: Option<bool>,
     /// From the beginning of the last push to rest.
@@ -148,6 +151,7 @@ impl Metrics {
                 steps_with_non_finite_torque: 0,
                 hand_error_at_deadline_m: None,
                 hand_error_hold_max_m: None,
+                hand_distance_left_m: None,
                 recovered: None,
                 settle_time_s: None,
                 energy_balance_error: None,
@@ -208,6 +212,7 @@ impl Metrics {
             }
             if (ball.deadline_ns..=ball.hold_end_ns).contains(&truth.time_ns) {
                 raise(&mut figures.hand_error_hold_max_m, error);
+                lower(&mut figures.hand_distance_left_m, error);
             }
         }
 

@@ -11,7 +11,6 @@ use delmpc_mechanics::reroot::Rerooted;
 use delmpc_messages::{Command, PlantState};
 use delmpc_robots::RobotModel;
 use delmpc_scenario::{Clock, ControllerKind, Scenario};
-use nalgebra::Vector3;
 
 use crate::setup::Setup;
 use crate::verdict::Failure;
@@ -72,8 +71,7 @@ impl<K> RobotController<K> {
 
     /// How far from the ball the hand is in the posture in which the reach ends, m: not 0 when the ball cannot be reached in balance.
     pub fn out_of_reach_m(&self) -> Option<f64> {
-        let (reach, goal) = self.controller.reference().reach.as_ref()?;
-        Some((goal.hand - Vector3::from(reach.ball_m)).norm())
+        self.controller.reference().reach.as_ref().map(|_| self.controller.hand_distance_left_m())
     }
 
     /// The controller itself: its plan, its model, its problem.

@@ -46,8 +46,11 @@ impl Setup {
         let urdf = find_robot(file, &scenario.robot.urdf);
         let robot = load(&urdf).map_err(Failure::input)?;
         let notes = document.notes().to_vec();
-        let setup = Self { scenario, robot, urdf, notes };
-        setup.check_names().map_err(|error| Failure::Input(format!("{}: {error}", file.display())))?;
+        let mut setup = Self { scenario, robot, urdf, notes };
+        let refused = |error: String| Failure::Input(format!("{}: {error}", file.display()));
+        setup.check_names().map_err(refused)?;
+        let warnings = crate::stance::check_scenario(&setup).map_err(refused)?;
+        setup.notes.extend(warnings);
         Ok(setup)
     }
 

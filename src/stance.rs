@@ -10,6 +10,7 @@ use delmpc_robots::{Posture, RobotModel, Sole};
 use nalgebra::Vector3;
 
 use crate::output::name_in_table;
+use crate::setup::Setup;
 use crate::sole::cop_margin_m;
 
 /// A sole counts as on the ground up to this height of its frame (m) ...
@@ -106,6 +107,51 @@ pub fn stances(robot: &RobotModel) -> Result<(String, Vec<String>), ModelError> 
         }
     }
     Ok((text, warnings))
+}
+
+/// What `model` warns of in the posture of a scenario. Two soles on the ground are refused: the controller stands on one.
+///
+/// # Errors
+/// In words, with key and remedy.
+pub fn check_scenario(setup: &Setup) -> Result<Vec<String>, String> {
+    let Setup { robot, scenario, .. } = setup;
+    let in_words = |error: ModelError| error.to_string();
+    let posture = robot.posture(&scenario.robot.posture);
+    let Some((posture, base)) = posture.and_then(|posture| Some((posture, robot.base_pose_w(posture)?)))
+    else {
+        return Ok(Vec::new());
+    };
+    let soles = soles_in(robot, posture, base).map_err(in_words)?;
+    let standing: Vec<&Stance> = soles.iter().filter(|stance| stance.stands()).collect();
+    let names = || standing.iter().map(|stance| stance.sole.name.as_str()).collect::<Vec<_>>().join(" and ");
+    if standing.len() > 1 {
+        return Err(format!(
+            "`robot.posture` = \"{}\": the robot stands on {}, and this controller balances on one sole: take a posture in which only \
+             `robot.stance` = \"{}\" is on the ground",
+            posture.name,
+            names(),
+            scenario.robot.stance
+        ));
+    }
+    let mut warnings = Vec::new();
+    let stance = soles.iter().find(|stance| stance.sole.name == scenario.robot.stance);
+    if let Some(stance) = stance {
+        if !stance.stands() {
+            warnings.push(no_sole_stands(stance));
+        }
+        if stance.margin_m() < 0.0 {
+            warnings.push(tips_over(stance));
+        }
+        warnings.extend(holding(robot, posture, stance.sole).map_err(in_words)?.warning);
+    }
+    let limits = robot.joint_names.iter().zip(&robot.limits).zip(&posture.q);
+    for ((name, limit), q) in limits.filter(|((_, limit), q)| !(limit.lower..=limit.upper).contains(*q)) {
+        warnings.push(format!(
+            "posture `{}`: joint `{name}` is at {q:.4}, outside its limits {:.4} to {:.4}",
+            posture.name, limit.lower, limit.upper
+        ));
+    }
+    Ok(warnings)
 }
 
 /// Every sole in a posture.

@@ -124,7 +124,7 @@ impl Summary {
 }
 
 /// The keys that others read: none of them may ever be missing.
-pub const KEYS: [&str; 49] = [
+pub const KEYS: [&str; 50] = [
     "scenario",
     "seed",
     "success",
@@ -143,6 +143,7 @@ pub const KEYS: [&str; 49] = [
     "max_torque_ratio",
     "hand_error_at_deadline_m",
     "hand_error_hold_max_m",
+    "hand_distance_left_m",
     "push_impulse_ns",
     "push_direction",
     "recovered",

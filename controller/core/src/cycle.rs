@@ -41,7 +41,7 @@ use crate::plan::Plan;
 use crate::posture_goal::posture_goal;
 use crate::prediction::Prediction;
 use crate::projected_qp::{ProjectedQp, ProjectedQpReport, default_backend};
-use crate::reference::Reference;
+use crate::reference::{Reach, Reference};
 use crate::riccati::Riccati;
 use crate::stop_watch::StopWatch;
 pub use crate::stop_watch::{Clock, StoppedClock};
@@ -104,6 +104,9 @@ pub struct Controller {
     unloaded_leg: Option<UnloadedLeg>,
     ladder: FallbackLadder,
     reference: Reference,
+    /// The reach as it was asked for, and how far from its goal the hand ends, m.
+    asked_reach: Option<Reach>,
+    hand_distance_left_m: f64,
     trim: BalanceTrim,
     targets: TaskTargets,
 
@@ -218,6 +221,8 @@ impl Controller {
             unloaded_leg,
             ladder: FallbackLadder::new(config.fallback),
             reference: Reference { home, reach: None, com_shift: Vector3::zeros() },
+            asked_reach: None,
+            hand_distance_left_m: 0.0,
             trim: BalanceTrim::new(config.trim_s),
             targets: TaskTargets::new(n),
             gravity: InverseDynamicsWorkspace::new(tree),

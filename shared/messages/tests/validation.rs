@@ -4,8 +4,8 @@
 
 use delmpc_messages::{
     ClockKind, Command, ConstraintKind, FallbackLevel, FootReading, Heartbeat, LATEST_TIME_NS,
-    LONGEST_VALIDITY_NS, MAX_FEET, MAX_JOINTS, Message, MessageError, PlantState, ProcessState, RateMean, Role,
-    Segment, ServoReadings, Verdict, foot, joint_set_hash, sensor, status,
+    LONGEST_VALIDITY_NS, MAX_FEET, MAX_JOINTS, Message, MessageError, PlantState, ProcessState, RateMean,
+    Role, Segment, ServoReadings, Verdict, foot, joint_set_hash, sensor, status,
 };
 
 const N: usize = 3;

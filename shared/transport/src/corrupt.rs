@@ -61,7 +61,7 @@ impl Corrupt for Command {
             &mut segment.acceleration_ref[..n],
             &mut position_gain[..n],
             &mut velocity_gain[..n],
-            &mut self.imu_gain[row],
+            &mut self.imu_gain[row][..if n == 0 { 0 } else { 6 }],
             &mut segment.imu_angle_ref,
             &mut segment.imu_rate_ref,
         ];

@@ -12,6 +12,9 @@ use crate::posture_goal::{posture_goal, reach_posture};
 use crate::reference::Reach;
 use crate::stage_dynamics::StageDynamics;
 
+/// A goal farther than this from where the hand is in the balanced posture nearest to it is moved there, m.
+const UNREACHABLE_M: f64 = 0.01;
+
 impl Controller {
     /// Cost and gain of standing still for ever, at the home posture.
     pub(super) fn solve_infinite_horizon(&mut self) -> Result<(), ControlError> {
@@ -61,15 +64,23 @@ impl Controller {
         self.prepared = None;
         self.reference.home = posture_goal(&self.model, &self.model.posture)?;
         self.solve_infinite_horizon()?;
-        self.set_reach(self.reference.reach.as_ref().map(|(reach, _)| *reach))
+        self.set_reach(self.asked_reach)
     }
 
-    /// Sets or clears the reach and computes the posture it ends in. Allocates.
+    /// How far from the goal the hand ends in the balanced posture nearest to it, m: beyond a centimetre the goal is moved there.
+    pub fn hand_distance_left_m(&self) -> f64 {
+        self.hand_distance_left_m
+    }
+
+    /// Sets or clears the reach and computes the posture it ends in. A goal that no balanced posture reaches is moved to the nearest one
+    /// ([`Self::hand_distance_left_m`]). Allocates.
     ///
     /// # Errors
     /// [`ControlError::Model`] when the model has no hand, [`ControlError::Mechanics`] when it does not fit.
     pub fn set_reach(&mut self, reach: Option<Reach>) -> Result<(), ControlError> {
+        self.asked_reach = reach;
         let Some(reach) = reach else {
+            self.hand_distance_left_m = 0.0;
             self.reference.reach = None;
             return Ok(());
         };
@@ -78,6 +89,12 @@ impl Controller {
         }
         let ball = Vector3::from(reach.ball_m);
         let goal = reach_posture(&self.model, &self.reference.home, &ball, &self.config.weights)?;
+        self.hand_distance_left_m = (goal.hand - ball).norm();
+        let mut reach = reach;
+        if self.hand_distance_left_m > UNREACHABLE_M {
+            // A hand that is drawn to where no balanced posture brings it draws the robot over: it goes as far as that posture.
+            reach.ball_m = goal.hand.into();
+        }
         self.reference.reach = Some((reach, goal));
         Ok(())
     }

@@ -1,0 +1,123 @@
+//! The main scenario on ground that leans or gives, from starts that are off, with sensors that are biased: lockstep, noise and delay as
+//! in the scenario. The whole campaign of figures: `cargo test --release --test feeling -- --ignored --nocapture`.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+use std::path::Path;
+
+use delmpc::log::Log;
+use delmpc::one_process::{Simulated, simulate};
+use delmpc::setup::{MAIN_SCENARIO, Setup};
+use delmpc::summary::Summary;
+use delmpc_controller_process::stop::StopFlag;
+
+fn run(overrides: &[String]) -> Summary {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(MAIN_SCENARIO);
+    let mut all = vec!["clock=lockstep".to_owned()];
+    all.extend_from_slice(overrides);
+    let setup = Setup::read(&file, &all).unwrap();
+    match simulate(&setup, Log::none(), &StopFlag::on_signals().unwrap()).unwrap() {
+        Simulated::Fault(why) => panic!("{overrides:?}: {why}"),
+        Simulated::Ended { plant, .. } => Summary::new(&setup.scenario, Some(*plant), None, None),
+    }
+}
+
+fn succeeds(overrides: &[String]) -> Summary {
+    let summary = run(overrides);
+    println!("{overrides:?}: {}", summary.failure.as_deref().unwrap_or("success"));
+    assert_eq!(summary.failure, None, "{overrides:?}");
+    summary
+}
+
+fn stands(overrides: &[String]) {
+    let summary = run(overrides);
+    println!("{overrides:?}: {}", summary.failure.as_deref().unwrap_or("success"));
+    assert!(!summary.plant.as_ref().is_some_and(|plant| plant.robot.fell), "{overrides:?}: {:?}", summary.failure);
+}
+
+fn slope(degrees: f64, eighth: u32) -> String {
+    let (size, towards) = (degrees.to_radians(), std::f64::consts::FRAC_PI_4 * f64::from(eighth));
+    format!("plant.slope_rad=[{:.6}, {:.6}]", size * towards.cos(), size * towards.sin())
+}
+
+/// Two and a half seconds: the reach, and a push right after.
+fn short() -> Vec<String> {
+    ["duration_s=4.0", "reach.start_s=0.6", "reach.hold_s=0.2", "reach.return_s=0.6", "push.start_s=2.8"]
+        .map(str::to_owned)
+        .to_vec()
+}
+
+fn with(change: &str) -> Vec<String> {
+    let mut overrides = short();
+    overrides.push(change.to_owned());
+    overrides.push("success.settle_time_s=3".to_owned());
+    overrides
+}
+
+#[test]
+fn it_stands_on_a_slope_and_on_ground_that_gives() {
+    let mut on_slope = with(&slope(3.0, 6));
+    on_slope.push("success.hand_error_hold_max_m=0.06".to_owned());
+    on_slope.push("success.hand_error_at_deadline_m=0.06".to_owned());
+    stands(&on_slope);
+    stands(&with("plant.ground_sink_m=0.7e-3"));
+    stands(&with("plant.ground_sink_m=2.5e-3"));
+}
+
+#[test]
+fn it_lands_from_starts_that_are_off() {
+    stands(&with("robot.start.height_m=5e-3"));
+    stands(&with("robot.start.roll_rad=0.0175"));
+}
+
+#[test]
+fn the_estimate_is_good_with_a_biased_gyroscope_and_a_biased_attitude_is_survived() {
+    let summary = run(&with("sensors.gyro_bias_rad_s=8.7e-3"));
+    let robot = &summary.plant.as_ref().unwrap().robot;
+    assert!(!robot.fell);
+    let (tilt, velocity) =
+        (robot.estimator_tilt_rms_rad.unwrap(), robot.estimator_velocity_rms_m_s.unwrap());
+    println!("tilt {:.3} degrees rms, velocity {velocity:.4} m/s rms", tilt.to_degrees());
+    assert!(tilt <= 0.2_f64.to_radians() && velocity <= 0.02);
+    stands(&with("sensors.imu_misalignment_rad=[0.0175, 0.0, 0.0]"));
+}
+
+#[test]
+#[ignore = "minutes"]
+fn slopes_sinks_and_starts_of_the_whole_scenario() {
+    for degrees in [1.0, 2.0, 3.0] {
+        for eighth in 0..8 {
+            succeeds(&[slope(degrees, eighth)]);
+        }
+    }
+    for mm in [0.05, 0.1, 0.3, 0.7, 1.3, 2.5] {
+        succeeds(&[format!("plant.ground_sink_m={mm}e-3")]);
+    }
+    for mm in [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0] {
+        succeeds(&[format!("robot.start.height_m={mm}e-3")]);
+    }
+    for degrees in [0.1_f64, 0.5, 1.0, 2.0] {
+        for (key, sign) in [("roll", 1.0), ("roll", -1.0), ("pitch", 1.0), ("pitch", -1.0)] {
+            stands(&[format!("robot.start.{key}_rad={}", sign * degrees.to_radians())]);
+        }
+    }
+}
+
+#[test]
+#[ignore = "minutes"]
+fn pushes_at_four_fifths_of_the_limit_on_ground_that_gives() {
+    for (x, y, limit) in [(1, 0, 75.0), (0, 1, 48.0), (-1, 0, 80.0), (0, -1, 42.0)] {
+        for mm in [0.3, 0.7, 2.0] {
+            for seed in 1..=4 {
+                stands(&[
+                    "reach.start_s=100".to_owned(),
+                    "push.start_s=1".to_owned(),
+                    "duration_s=6".to_owned(),
+                    format!("push.direction=[{x}, {y}, 0]"),
+                    format!("push.impulse_ns={}", 0.8 * limit),
+                    format!("plant.ground_sink_m={mm}e-3"),
+                    format!("seed={seed}"),
+                ]);
+            }
+        }
+    }
+}
