@@ -1,0 +1,126 @@
+//! The Newton system of the stage chain: `Σ_k` of stage matrices in `[Y_k | X_k | X_{k+1}]`.
+//!
+//! ```text
+//! for k = 0..N-1:  A_k[X_k, X_k] += what is left of stage k-1;   partial Cholesky of the columns Y_k, X_k;   the rest goes to k+1
+//! last:            Cholesky of X_N
+//! ```
+//!
+//! This is a Riccati sweep forwards in time. Cost per stage: a partial Cholesky of the stage matrix.
+
+use pulp::Arch;
+
+use crate::dense::{backward, forward, padded, partial_cholesky};
+use crate::layout::Layout;
+
+/// Factors of the chain.
+#[derive(Clone, Debug)]
+pub struct Chain {
+    arch: Arch,
+    layout: Layout,
+    stages: usize,
+    ld: usize,
+    factors: Vec<Vec<f64>>,
+    last: Vec<f64>,
+    last_ld: usize,
+    local: Vec<f64>,
+}
+
+impl Chain {
+    /// Creates the memory for a chain.
+    pub fn new(arch: Arch, layout: Layout, stages: usize) -> Self {
+        let ld = padded(layout.stage);
+        let last_ld = padded(layout.boundary);
+        Self {
+            arch,
+            layout,
+            stages,
+            ld,
+            factors: vec![vec![0.0; ld * layout.stage]; stages],
+            last: vec![0.0; last_ld * layout.boundary],
+            last_ld,
+            local: vec![0.0; layout.stage],
+        }
+    }
+
+    /// Factorises `A + diag(diagonal)` with the rows and columns of fixed unknowns replaced by the identity.
+    ///
+    /// # Errors
+    /// The first stage whose matrix is not positive definite.
+    pub fn factorise<'a>(
+        &mut self,
+        matrix: impl Fn(usize) -> &'a [f64],
+        diagonal: &[f64],
+        fixed: &[bool],
+    ) -> Result<(), usize> {
+        let Self { layout, ld, stages, .. } = *self;
+        let (inner, boundary, size) = (layout.inner, layout.boundary, layout.stage);
+        let pivots = inner + boundary;
+        for k in 0..stages {
+            let a = &mut self.factors[k];
+            a.copy_from_slice(matrix(k));
+            let at = layout.boundary_at(stages, k);
+            let index = |i: usize| if i < inner { layout.inner_at(k) + i } else { at + i - inner };
+            let last = k + 1 == stages;
+            for i in 0..size {
+                let own = i < pivots || last;
+                if own {
+                    a[i * ld + i] += diagonal[index(i)];
+                }
+                if fixed[index(i)] {
+                    for j in 0..i {
+                        a[j * ld + i] = 0.0;
+                    }
+                    a[i * ld + i..i * ld + size].fill(0.0);
+                    a[i * ld + i] = if own { 1.0 } else { 0.0 };
+                }
+            }
+            if k > 0 {
+                let (before, after) = self.factors.split_at_mut(k);
+                let rest = &before[k - 1];
+                for j in 0..boundary {
+                    let from = (pivots + j) * ld + pivots;
+                    let to = (inner + j) * ld + inner;
+                    for i in j..boundary {
+                        after[0][to + i] += rest[from + i];
+                    }
+                }
+            }
+            partial_cholesky(self.arch, &mut self.factors[k], ld, size, pivots).map_err(|_| k)?;
+        }
+        let rest = &self.factors[stages - 1];
+        for j in 0..boundary {
+            for i in j..boundary {
+                self.last[j * self.last_ld + i] = rest[(pivots + j) * ld + pivots + i];
+            }
+        }
+        partial_cholesky(self.arch, &mut self.last, self.last_ld, boundary, boundary).map_err(|_| stages)
+    }
+
+    /// Solves in place.
+    pub fn solve(&mut self, x: &mut [f64]) {
+        let Self { layout, ld, stages, .. } = *self;
+        let (inner, boundary, size) = (layout.inner, layout.boundary, layout.stage);
+        let pivots = inner + boundary;
+        for k in 0..stages {
+            layout.gather(stages, k, x, &mut self.local);
+            forward(&self.factors[k], ld, size, pivots, &mut self.local);
+            put(&layout, stages, k, &self.local, x);
+        }
+        let at = layout.boundary_at(stages, stages);
+        let end = &mut x[at..at + boundary];
+        forward(&self.last, self.last_ld, boundary, boundary, end);
+        backward(&self.last, self.last_ld, boundary, boundary, end);
+        for k in (0..stages).rev() {
+            layout.gather(stages, k, x, &mut self.local);
+            backward(&self.factors[k], ld, size, pivots, &mut self.local);
+            put(&layout, stages, k, &self.local, x);
+        }
+    }
+}
+
+fn put(layout: &Layout, stages: usize, k: usize, z: &[f64], plan: &mut [f64]) {
+    let (inner, ends) = z.split_at(layout.inner);
+    plan[layout.inner_at(k)..layout.inner_at(k + 1)].copy_from_slice(inner);
+    let at = layout.boundary_at(stages, k);
+    plan[at..at + 2 * layout.boundary].copy_from_slice(ends);
+}
