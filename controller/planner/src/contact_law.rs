@@ -29,9 +29,9 @@ pub const SMALL: usize = 25;
 /// Most rows.
 pub const ROWS: usize = 17;
 /// Softening of the length of a tangential impulse, units of S.
-const IMPULSE_SOFTNESS: f64 = 1e-4;
+pub(crate) const IMPULSE_SOFTNESS: f64 = 1e-4;
 /// Softening of the length of a slip, m.
-const SLIP_SOFTNESS: f64 = 1e-5;
+pub(crate) const SLIP_SOFTNESS: f64 = 1e-5;
 
 /// Constants of the law, the same for all contacts of a plan.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -139,6 +139,8 @@ struct Evaluation<'a> {
     ground: [Profile; 3],
     /// `φ'` = φ + σ d Π: the additional part.
     forbidden: [Profile; 3],
+    /// How far the gap rows let a point sink.
+    slack: f64,
 }
 
 impl LawRows {
@@ -193,7 +195,7 @@ impl<'a> Evaluation<'a> {
                 };
             }
         }
-        Self { law, x, ground, forbidden }
+        Self { law, x, ground, forbidden, slack: terrain.ground_slack_m }
     }
 
     fn height(&self, node: usize) -> usize {
@@ -219,9 +221,9 @@ impl<'a> Evaluation<'a> {
         let gaps = [0, 1, 2].map(|node| self.gap(node, radius));
         let normal_speed = x[law.velocity() + law.tangents];
         let approach = law.half_stage_s * normal_speed;
-        out.value[0] = gaps[1];
-        out.value[1] = gaps[2];
-        out.value[2] = gaps[2] + approach;
+        out.value[0] = gaps[1] + self.slack;
+        out.value[1] = gaps[2] + self.slack;
+        out.value[2] = gaps[2] + approach + self.slack;
         let closed = [0, 1, 2].map(|node| gaps[node] + self.forbidden[node].value);
         let (n0, n1, n2) = (x[law.normal(0)], x[law.normal(1)], x[law.normal(2)]);
         let mut product = (n0 + n1) * (closed[0] + closed[1] + closed[2]) + n2 * (2.0 * closed[2] + approach);
@@ -378,7 +380,7 @@ impl<'a> Evaluation<'a> {
 }
 
 /// `sqrt(square + ε²) - ε`.
-fn soft_length(square: f64, softness: f64) -> f64 {
+pub(crate) fn soft_length(square: f64, softness: f64) -> f64 {
     let length = (square + softness * softness).sqrt();
     square / (length + softness)
 }

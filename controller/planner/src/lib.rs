@@ -5,6 +5,7 @@
 
 pub mod barrier;
 pub mod chain;
+pub mod check;
 pub mod contact_law;
 pub mod dense;
 pub mod error;

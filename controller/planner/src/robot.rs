@@ -158,13 +158,30 @@ impl PlanRobot {
     /// # Errors
     /// [`PlanError::UnknownName`]; [`PlanError::Mechanics`] when the tree refuses the values.
     pub fn with_springs(&self, springs: &[(&str, f64, f64)]) -> Result<Self, PlanError> {
-        let mut builder = TreeBuilder::fixed_base(*self.tree.gravity_w());
-        builder.accept_unreal_inertia();
         let mut bodies = self.tree.bodies().to_vec();
         for &(name, stiffness, rest) in springs {
             let joint = &mut bodies[self.coordinate(name)?].joint;
             (joint.stiffness, joint.rest) = (stiffness, rest);
         }
+        self.with_bodies(bodies)
+    }
+
+    /// The same robot with the damping (N m s/rad) and the spring (N m/rad, rad) of every coordinate.
+    ///
+    /// # Errors
+    /// [`PlanError::Mechanics`] when the tree refuses the values.
+    pub fn with_joint_laws(&self, damping: &[f64], springs: &[[f64; 2]]) -> Result<Self, PlanError> {
+        let mut bodies = self.tree.bodies().to_vec();
+        for ((body, &damping), &[stiffness, rest]) in bodies.iter_mut().zip(damping).zip(springs) {
+            let joint = &mut body.joint;
+            (joint.damping, joint.stiffness, joint.rest) = (damping, stiffness, rest);
+        }
+        self.with_bodies(bodies)
+    }
+
+    fn with_bodies(&self, bodies: Vec<Body>) -> Result<Self, PlanError> {
+        let mut builder = TreeBuilder::fixed_base(*self.tree.gravity_w());
+        builder.accept_unreal_inertia();
         for body in bodies {
             builder.add(body);
         }

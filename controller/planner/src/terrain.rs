@@ -72,6 +72,9 @@ pub struct Terrain {
     pub edge_margin_m: f64,
     /// How much the smooth profile of an obstacle exceeds it in height, m.
     pub obstacle_margin_m: f64,
+    /// How far a contact point may sink below the ground, m.
+    #[serde(default)]
+    pub ground_slack_m: f64,
 }
 
 /// A function of x with two derivatives.
