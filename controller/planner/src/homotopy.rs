@@ -1,8 +1,8 @@
 //! From a guess to a plan: κ → 0 in two passes.
 //!
 //! ```text
-//! P1 pass 1: κ = 1, ½, ¼ .. 1e-4,       δ = clamp(0.05 κ, 1e-7, 1e-2),  σ = min(1, step/6);   from the guess
-//!    pass 2: κ = 1e-4, x 0.35 .. 1e-6,  δ = 0.3 κ,                      σ = 1;                from pass 1
+//! P1 pass 1: κ = 1, x 0.35 .. 3e-4,     δ = clamp(0.05 κ, 1e-7, 1e-2),  σ = min(1, step/6);   from the guess
+//!    pass 2: κ = 3e-4, x 0.3 .. 1e-6,   δ = 0.3 κ,                      σ = 1;                from pass 1
 //!    both with all multipliers zero at first;  μ = 0.1 min(κ, 0.1)
 //! P2   rounds (2; pass 2: 3; last κ: 14):
 //! P3     Newton on Φ until |∇Φ| < 1e-2 min(1, 1e-3/δ)
@@ -42,13 +42,13 @@ pub struct Schedule {
 impl Default for Schedule {
     fn default() -> Self {
         Self {
-            kappa_between: 1e-4,
+            kappa_between: 3e-4,
             kappa_end: 1e-6,
             first_penalty: 0.05,
-            first_factor: 0.5,
-            second_factor: 0.35,
-            iterations: 60,
-            tolerance: 1e-6,
+            first_factor: 0.35,
+            second_factor: 0.3,
+            iterations: 80,
+            tolerance: 4e-6,
             least_penalty: 1e-9,
             first_update: 10.0,
         }
@@ -200,7 +200,7 @@ pub fn second_pass(
             rounds: if last { 14 } else { 3 },
             iterations: schedule.iterations,
             update: 10.0,
-            tolerance: if last { 1e-7 } else { 1e-4 },
+            tolerance: if last { 3e-7 } else { 1e-4 },
             done: 0.6 + 0.4 * step / (count + 1.0),
         };
         let mut outcome = climb(minimiser, schedule, &rung, watch)?;

@@ -81,9 +81,9 @@ pub struct Minimiser<'a> {
     pub curvature: Curvature,
     /// Effort so far.
     pub effort: Effort,
-    engine: Engine,
-    supports: Vec<ContactSupport>,
-    derivatives: Vec<StageDerivatives>,
+    pub(crate) engine: Engine,
+    pub(crate) supports: Vec<ContactSupport>,
+    pub(crate) derivatives: Vec<StageDerivatives>,
     curvatures: Vec<Vec<f64>>,
     no_curvature: Vec<f64>,
     multipliers: Vec<Vec<f64>>,
@@ -97,11 +97,11 @@ pub struct Minimiser<'a> {
     diagonal: Vec<f64>,
     bound_diagonal: Vec<f64>,
     scale: Vec<f64>,
-    fixed: Vec<bool>,
+    pub(crate) fixed: Vec<bool>,
     regularisation: f64,
-    chain: Chain,
-    z: Vec<f64>,
-    rows: Vec<f64>,
+    pub(crate) chain: Chain,
+    pub(crate) z: Vec<f64>,
+    pub(crate) rows: Vec<f64>,
     scratch: Vec<f64>,
 }
 

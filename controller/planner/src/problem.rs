@@ -257,4 +257,37 @@ impl Problem {
     pub fn linear_row(&self) -> usize {
         self.step_row() + 2
     }
+
+    /// A row in words.
+    pub fn row_name(&self, row: usize) -> String {
+        let n = self.layout.n;
+        if row < self.equalities() {
+            return format!(
+                "DEL row of {} at node {}",
+                self.robot.coordinates[row % n],
+                ["0", "½", "1"][row / n]
+            );
+        }
+        if row < self.clearance_row(0, 0) {
+            let (contact, law) =
+                ((row - self.equalities()) / self.law.rows(), (row - self.equalities()) % self.law.rows());
+            let what = match law {
+                0 | 1 => "gap",
+                2 => "speed into the ground",
+                _ if law == self.law.product_row() => "product",
+                _ if law > self.law.product_row() => "touchdown speed",
+                _ => "friction cone or slip bound",
+            };
+            return format!("{what} of {}", self.contacts[contact].name);
+        }
+        if row < self.step_row() {
+            let point = (row - self.clearance_row(0, 0)) % self.clearance.len();
+            return format!("clearance of {}", self.clearance[point].name);
+        }
+        if row < self.linear_row() {
+            "stage length".to_owned()
+        } else {
+            "joint rate before an impact".to_owned()
+        }
+    }
 }
