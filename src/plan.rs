@@ -5,11 +5,12 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use delmpc_planner::check::{Bounds, Findings, check};
+use delmpc_planner::execution::{Execution, execute};
 use delmpc_planner::outline::leg_outline;
 use delmpc_planner::plan_file::Plan;
 use delmpc_planner::planner::{Planned, Search, plan as search_plan};
 use delmpc_planner::robot::PlanRobot;
-use delmpc_planner::task::{BaseBounds, ExecutionLimits, PlanWeights, Task};
+use delmpc_planner::task::{BaseBounds, ExecutionLimits, PlanWeights, Standing, Task};
 use delmpc_planner::terrain::{Gap, Obstacle, Step, Terrain};
 use delmpc_robots::load;
 use delmpc_scenario::{Document, PlanSettings, PlanWeightSettings, Scenario};
@@ -69,9 +70,14 @@ fn check_plan(file: &Path, arguments: &PlanArguments) -> Result<Ended, Failure> 
             file.display()
         )));
     }
-    let robot = PlanRobot::new(&load(&urdf).map_err(Failure::input)?).map_err(Failure::input)?;
+    let model = load(&urdf).map_err(Failure::input)?;
+    let robot = match &plan.standing {
+        Some(sole) => PlanRobot::standing(&model, sole),
+        None => PlanRobot::new(&model),
+    }
+    .map_err(Failure::input)?;
     let findings = check(&plan, &robot).map_err(Failure::input)?;
-    say(&plan, &findings, arguments.json)?;
+    say(&plan, &findings, execute(&plan, &robot).ok().as_ref(), arguments.json)?;
     let holds = findings.passes(&Bounds::default());
     Ok(if holds { Ended::Well } else { Ended::CriterionMissed })
 }
@@ -118,7 +124,8 @@ fn make_plan(file: &Path, arguments: &PlanArguments) -> Result<Ended, Failure> {
     };
     let text = planned.plan.to_json().map_err(Failure::fault)?;
     std::fs::write(&out, text).map_err(|error| Failure::Fault(format!("{}: {error}", out.display())))?;
-    say(&planned.plan, &planned.findings, arguments.json)?;
+    let found = execute(&planned.plan, &task.robot).ok();
+    say(&planned.plan, &planned.findings, found.as_ref(), arguments.json)?;
     if !arguments.json {
         say_attempts(&planned, &out);
     }
@@ -142,7 +149,12 @@ fn task_of(
         .iter()
         .map(|spring| (spring.joint.as_str(), spring.stiffness_nm_per_rad, spring.rest_rad))
         .collect();
-    let robot = PlanRobot::new(&model)?.with_springs(&springs)?;
+    let reaches = !settings.hand.is_empty();
+    let robot =
+        if reaches { PlanRobot::standing(&model, &scenario.robot.stance)? } else { PlanRobot::new(&model)? };
+    let robot = robot.with_springs(&springs)?;
+    let standing = if reaches { Some(standing_of(&model, scenario, settings)) } else { None };
+    let reach = if reaches { Some((robot.frame(&settings.hand)?.clone(), settings.target_m)) } else { None };
     let start = robot.posture(&scenario.robot.posture)?.to_vec();
     let mut bounds = Vec::new();
     for bound in &settings.bound {
@@ -171,11 +183,29 @@ fn task_of(
         alike: alike(&robot),
         execution: settings.execution.then_some(ExecutionLimits {
             touchdown_speed_m_s: settings.touchdown_speed_m_s,
-            impact_impulse: settings.impact_impulse,
+            impact_impulse_ns: settings.impact_impulse_ns,
         }),
+        standing,
+        reach,
         guess_lift_m: settings.guess_lift_m,
         robot,
     })
+}
+
+/// The sole's bounding box less the margin.
+fn standing_of(model: &delmpc_robots::RobotModel, scenario: &Scenario, settings: &PlanSettings) -> Standing {
+    let polygon = model.sole(&scenario.robot.stance).map_or(&[][..], |sole| sole.polygon.as_slice());
+    let range = |axis: usize| {
+        let values = polygon.iter().map(|corner| corner[axis]);
+        let (low, high) =
+            values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (low.min(x), high.max(x)));
+        [low + settings.cop_margin_m, high - settings.cop_margin_m]
+    };
+    Standing {
+        sole: scenario.robot.stance.clone(),
+        pressure_m: [range(0), range(1)],
+        yaw_arm_m: settings.yaw_arm_m,
+    }
 }
 
 fn terrain_of(settings: &PlanSettings) -> Terrain {
@@ -231,12 +261,12 @@ fn progress_bar(quiet: bool) -> ProgressBar {
     bar
 }
 
-fn say(plan: &Plan, findings: &Findings, json: bool) -> Result<(), Failure> {
+fn say(plan: &Plan, findings: &Findings, found: Option<&Execution>, json: bool) -> Result<(), Failure> {
     let bounds = Bounds::default();
     if json {
         let value = serde_json::json!({
             "name": plan.name, "robot": plan.robot, "note": plan.note, "stages": plan.stages,
-            "passes": findings.passes(&bounds), "findings": findings, "contact_sets": plan.sets(),
+            "passes": findings.passes(&bounds), "findings": findings, "execution": found, "contact_sets": plan.sets(),
             "provenance": plan.provenance,
         });
         println!("{}", serde_json::to_string(&value).map_err(Failure::fault)?);
@@ -260,7 +290,32 @@ fn say(plan: &Plan, findings: &Findings, json: bool) -> Result<(), Failure> {
         findings.impact_s,
         1e3 * findings.longest_stage_s
     );
-    println!("    lowest point between nodes {:.1} mm", 1e3 * findings.lowest_m);
+    if let Some(sole) = &findings.sole {
+        let [[x0, x1], [y0, y1]] = sole.pressure_m.map(|range| range.map(|x| 1e3 * x));
+        println!(
+            "    pressure point x {x0:.1} .. {x1:.1} mm, y {y0:.1} .. {y1:.1} mm, friction {:.2}",
+            sole.friction
+        );
+    } else {
+        println!("    lowest point between nodes {:.1} mm", 1e3 * findings.lowest_m);
+    }
+    if let Some(hand) = findings.hand_m {
+        println!("    hand to target {:.2} mm", 1e3 * hand);
+    }
+    // Stages integrated finely say whether the plan can be carried out; a plan that breaks apart there has no figures.
+    if let Some(found) = found {
+        println!(
+            "    stages integrated finely: off by {:.1e} rad, {:.1e} rad/s; {} of {} beyond 0.01 rad or 0.3 rad/s",
+            found.position,
+            found.rate,
+            found.stages_off.len(),
+            plan.stages
+        );
+        println!(
+            "    before impacts: {:.2} m/s down, {:.1} rad/s",
+            found.touchdown_m_s, found.rate_before_impact
+        );
+    }
     if let Some(edge) = findings.edge_m {
         println!("    footholds to edges {:.1} mm", 1e3 * edge);
     }

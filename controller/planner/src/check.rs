@@ -61,6 +61,45 @@ pub struct Findings {
     pub impact_s: f64,
     /// Fastest approach of a contact before it is loaded, from the polynomial's end, m/s.
     pub touchdown_m_s: f64,
+    /// What the sole of a standing robot takes at the nodes; none for robots with contact points.
+    pub sole: Option<SoleUse>,
+    /// Distance of the hand from its target at the end, m; none without a target.
+    pub hand_m: Option<f64>,
+}
+
+/// What a standing sole takes: extremes over a plan.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct SoleUse {
+    /// Pressure point in the sole's frame: least and largest x, y, m.
+    pub pressure_m: [[f64; 2]; 2],
+    /// Horizontal force over vertical force.
+    pub friction: f64,
+    /// Yaw torque over vertical force, m.
+    pub yaw_arm_m: f64,
+    /// Least vertical force over the weight.
+    pub least_load: f64,
+}
+
+impl SoleUse {
+    /// Nothing seen yet.
+    pub const NONE: Self = Self {
+        pressure_m: [[f64::INFINITY, f64::NEG_INFINITY]; 2],
+        friction: 0.0,
+        yaw_arm_m: 0.0,
+        least_load: f64::INFINITY,
+    };
+
+    /// Takes a wrench (force, moment about the sole's origin) into account; `weight` in the units of the force.
+    pub fn add(&mut self, wrench: &[f64; 6], weight: f64) {
+        let [fx, fy, fz, mx, my, mz] = *wrench;
+        for (axis, at) in [-my / fz, mx / fz].into_iter().enumerate() {
+            self.pressure_m[axis][0] = self.pressure_m[axis][0].min(at);
+            self.pressure_m[axis][1] = self.pressure_m[axis][1].max(at);
+        }
+        self.friction = self.friction.max(fx.hypot(fy) / fz);
+        self.yaw_arm_m = self.yaw_arm_m.max((mz / fz).abs());
+        self.least_load = self.least_load.min(fz / weight);
+    }
 }
 
 /// Bounds of a plan that counts as done.
@@ -169,7 +208,8 @@ pub fn robot_of(plan: &Plan, robot: &PlanRobot) -> Result<PlanRobot, PlanError> 
 pub fn check(plan: &Plan, robot: &PlanRobot) -> Result<Findings, PlanError> {
     let robot = robot_of(plan, robot)?;
     let mut checker = Checker::new(plan, &robot)?;
-    let mut findings = Findings { lowest_m: f64::INFINITY, ..Findings::default() };
+    let lowest_m = if robot.contacts.is_empty() { 0.0 } else { f64::INFINITY };
+    let mut findings = Findings { lowest_m, ..Findings::default() };
     for k in 0..plan.stages {
         findings.del_s = findings.del_s.max(checker.del(k)?);
         checker.contacts(k, &mut findings)?;
@@ -182,6 +222,7 @@ pub fn check(plan: &Plan, robot: &PlanRobot) -> Result<Findings, PlanError> {
         }
     }
     checker.flights(&mut findings);
+    checker.standing(&mut findings)?;
     if let Some(x) = robot.coordinates.iter().position(|name| name == "base_x") {
         findings.mean_speed_m_s = (plan.q[plan.stages][x] - plan.q[0][x]) / plan.t[plan.stages];
     }
@@ -295,6 +336,12 @@ impl<'a> Checker<'a> {
                 }
             }
         }
+        for (node, wrench) in plan.sole_wrench.get(k).into_iter().flatten().enumerate() {
+            // Virtual joints: translations along x, y, z, rotations about z, y, x.
+            for (j, c) in [0, 1, 2, 5, 4, 3].into_iter().enumerate() {
+                rows[node * n + j] += wrench[c];
+            }
+        }
         Ok(rows.iter().fold(0.0f64, |worst, row| worst.max(row.abs())) / plan.impulse_unit_ns)
     }
 
@@ -310,7 +357,7 @@ impl<'a> Checker<'a> {
         let half = 0.5 * plan.horizon_s / plan.stages as f64;
         let dt = plan.t[k + 1] - plan.t[k];
         let s = plan.impulse_unit_ns;
-        let tangents = plan.dimension() - 1;
+        let tangents = plan.dimension().saturating_sub(1);
         let axes: &[usize] = if tangents == 1 { &[0] } else { &[0, 1] };
         let at = [
             self.positions(self.node(k, 0))?,
@@ -401,9 +448,41 @@ impl<'a> Checker<'a> {
         Ok(())
     }
 
+    /// What the sole takes, and where the hand ends.
+    fn standing(&mut self, findings: &mut Findings) -> Result<(), PlanError> {
+        let plan = self.plan;
+        let mass: f64 = self.robot.tree.bodies().iter().map(|body| body.inertia.mass).sum();
+        for (k, nodes) in plan.sole_wrench.iter().enumerate() {
+            let dt = plan.t[k + 1] - plan.t[k];
+            for (node, wrench) in nodes.iter().enumerate() {
+                let weight = mass * plan.gravity * dt * crate::stage::WEIGHTS[node];
+                findings.sole.get_or_insert(SoleUse::NONE).add(wrench, weight);
+            }
+        }
+        let target = plan.task.get("hand").and_then(Value::as_str).zip(plan.task.get("target_m"));
+        if let Some((name, target)) = target {
+            let frame = self.robot.frames.iter().find(|frame| frame.name == name).ok_or_else(|| {
+                PlanError::PlanFile {
+                    file: plan.name.clone(),
+                    what: format!("the robot has no frame `{name}`"),
+                }
+            })?;
+            let tree = &self.robot.tree;
+            let end = Configuration::fixed(&plan.q[plan.stages]);
+            self.kinematics.update_positions(tree, &end).map_err(mechanics)?;
+            let hand = self.kinematics.point_w(frame.body, &Vector3::from(frame.point));
+            let at = |a: usize| target.get(a).and_then(Value::as_f64).unwrap_or(f64::NAN);
+            findings.hand_m = Some((hand - Vector3::new(at(0), at(1), at(2))).norm());
+        }
+        Ok(())
+    }
+
     /// Longest flight, and how much of the time over an obstacle is flight.
     fn flights(&self, findings: &mut Findings) {
         let plan = self.plan;
+        if plan.contacts.is_empty() {
+            return;
+        }
         let in_flight = |k: usize| (0..plan.contacts.len()).all(|i| !plan.is_loaded(k, i));
         let mut length = 0.0;
         for k in 0..plan.stages {

@@ -10,8 +10,8 @@
 //! or lift-off inside a stage is impossible at κ = 0 and the solver moves the stage boundaries onto the events.
 //! `τ·s + μ n γ` is the duality gap of maximum dissipation: friction without a polyhedron. Restitution 0.
 //!
-//! An optional row bounds the speed of approach at the end of the stage, before an impact:
-//! `φ^0 - 4 φ^½ + 3 φ^1 + v_max Δt >= 0`.
+//! An optional row bounds the speed of approach at the end of the stage, before an impact, the less the higher the point is:
+//! `φ^0 - 4 φ^½ + 3 φ^1 + v_max Δt + 4 φ^1 >= 0`.
 //!
 //! Everything here is in the *small variables* of a contact:
 //!
@@ -24,6 +24,8 @@
 
 use crate::terrain::{Profile, Terrain};
 
+/// What a point that is still in the air may approach faster, per height and stage.
+const RELIEF: f64 = 4.0;
 /// Most small variables.
 pub const SMALL: usize = 25;
 /// Most rows.
@@ -253,7 +255,7 @@ impl<'a> Evaluation<'a> {
         out.value[law.product_row()] = homotopy.kappa - product;
         if let Some(speed) = law.touchdown_speed {
             out.value[law.product_row() + 1] =
-                gaps[0] - 4.0 * gaps[1] + 3.0 * gaps[2] + speed * x[law.step()];
+                gaps[0] - 4.0 * gaps[1] + (3.0 + RELIEF) * gaps[2] + speed * x[law.step()];
         }
     }
 
@@ -272,7 +274,7 @@ impl<'a> Evaluation<'a> {
         let mut weights = [0.0, l[0], l[1] + l[2]];
         if let Some(speed) = law.touchdown_speed {
             let row = law.product_row() + 1;
-            for (node, factor) in [1.0, -4.0, 3.0].into_iter().enumerate() {
+            for (node, factor) in [1.0, -4.0, 3.0 + RELIEF].into_iter().enumerate() {
                 self.add_gap(&mut out.gradient[row], node, factor);
                 weights[node] += factor * l[row];
             }

@@ -23,6 +23,8 @@ pub struct Schedule {
     pub kappa_between: f64,
     /// Where pass 2 ends.
     pub kappa_end: f64,
+    /// Where the pass of a refined plan begins.
+    pub kappa_refined: f64,
     /// `δ/κ` in pass 1.
     pub first_penalty: f64,
     /// Factor from one κ to the next in pass 1.
@@ -31,6 +33,8 @@ pub struct Schedule {
     pub second_factor: f64,
     /// Newton iterations per round.
     pub iterations: usize,
+    /// Rounds at each κ of pass 1.
+    pub first_rounds: usize,
     /// Violation below which a plan is one.
     pub tolerance: f64,
     /// Smallest penalty parameter.
@@ -44,10 +48,12 @@ impl Default for Schedule {
         Self {
             kappa_between: 3e-4,
             kappa_end: 1e-6,
+            kappa_refined: 1e-4,
             first_penalty: 0.05,
             first_factor: 0.35,
             second_factor: 0.3,
             iterations: 80,
+            first_rounds: 2,
             tolerance: 4e-6,
             least_penalty: 1e-9,
             first_update: 10.0,
@@ -162,10 +168,10 @@ pub fn first_pass(
             kappa,
             sigma: (step / 6.0f64).min(1.0),
             delta: (schedule.first_penalty * kappa).clamp(1e-7, 1e-2),
-            rounds: 2,
+            rounds: schedule.first_rounds,
             iterations: schedule.iterations,
             update: schedule.first_update,
-            tolerance: 1e-3,
+            tolerance: kappa.min(1e-3),
             done: 0.6 * step / count,
         };
         let outcome = climb(minimiser, schedule, &rung, watch)?;

@@ -9,6 +9,7 @@ pub mod check;
 pub mod contact_law;
 pub mod dense;
 pub mod error;
+pub mod execution;
 pub mod homotopy;
 pub mod layout;
 pub mod newton;

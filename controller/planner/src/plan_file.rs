@@ -87,6 +87,12 @@ pub struct Plan {
     pub impulse: Vec<Vec<Vec<Vec<f64>>>>,
     /// Slip bounds, m.
     pub slip_bound: Vec<Vec<Vec<f64>>>,
+    /// Name of the sole that the robot stands on throughout; its frame is {0} then.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub standing: Option<String>,
+    /// Wrench impulse of the ground on that sole about its frame's origin, per stage and node: force, moment (N s, N m s).
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub sole_wrench: Vec<[[f64; 6]; 3]>,
     /// Contact sets, one text per contact.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub contact_sets: Vec<String>,
@@ -190,6 +196,9 @@ impl Plan {
                 }
             }
         }
+        if self.standing.is_some() {
+            length("sole_wrench", self.sole_wrench.len(), stages)?;
+        }
         if let Some(k) = (0..stages).find(|&k| self.t[k + 1] <= self.t[k]) {
             return Err(format!("`t` does not increase at stage {k}"));
         }
@@ -219,6 +228,11 @@ impl Plan {
         };
         let bound = |k: usize, i: usize, node: usize| {
             x[layout.inner_at(k) + layout.contact(i) + law.slip(node) - first]
+        };
+        // The unknowns are in the order of the virtual joints: forces x, y, z, torques about z, y, x.
+        let wrench = |k: usize| {
+            [0, 1, 2]
+                .map(|node| [0, 1, 2, 5, 4, 3].map(|c| s * x[layout.inner_at(k) + layout.sole(node) + c]))
         };
         let names =
             |indices: &[usize]| indices.iter().map(|&j| problem.robot.coordinates[j].clone()).collect();
@@ -255,6 +269,8 @@ impl Plan {
                     (0..layout.contacts).map(|i| (0..3).map(|node| bound(k, i, node)).collect()).collect()
                 })
                 .collect(),
+            standing: None,
+            sole_wrench: if layout.wrench > 0 { (0..stages).map(wrench).collect() } else { Vec::new() },
             contact_sets: Vec::new(),
             residual: Map::new(),
             kappa,
@@ -280,7 +296,7 @@ impl Plan {
                 problem.robot.coordinates.join(", ")
             )));
         }
-        if self.stages != problem.stages || self.dimension() != law.dimension() {
+        if self.stages != problem.stages || (layout.contacts > 0 && self.dimension() != law.dimension()) {
             return Err(refuse(format!("{} stages, the problem has {}", self.stages, problem.stages)));
         }
         let n = layout.n;
@@ -297,6 +313,13 @@ impl Plan {
             let at = layout.inner_at(k);
             x[at..at + n].copy_from_slice(&self.q_mid[k]);
             x[at + layout.input(0)..at + layout.input(0) + layout.inputs].copy_from_slice(&self.u[k]);
+            for (node, wrench) in self.sole_wrench.get(k).into_iter().flatten().enumerate() {
+                for (c, from) in [0, 1, 2, 5, 4, 3].into_iter().enumerate() {
+                    if layout.wrench > 0 {
+                        x[at + layout.sole(node) + c] = wrench[from] / problem.unit_ns;
+                    }
+                }
+            }
             for i in 0..layout.contacts {
                 let at = at + layout.contact(i);
                 for node in 0..3 {

@@ -18,6 +18,9 @@ use crate::task::Task;
 /// Largest violation from which a plan is projected on DEL = 0.
 const PROJECTABLE: f64 = 1e-4;
 
+/// Where the barrier of a robot without contact points begins, as a relaxation.
+const KAPPA_STANDING: f64 = 1e-2;
+
 /// How a plan is looked for.
 #[derive(Clone, Debug)]
 pub struct Search {
@@ -29,7 +32,7 @@ pub struct Search {
     pub seed: u64,
     /// Size of the shifts of angles, rad; of the base, a third of it in m.
     pub noise_rad: f64,
-    /// The kept plan is cut into this many stages (a multiple of the task's) and solved again.
+    /// The kept plan is cut into this many stages (a multiple of the task's), by doubling where that divides, and solved again.
     pub refine_to: Option<usize>,
     /// Time after which the search ends with what it has.
     pub budget: Option<Duration>,
@@ -117,9 +120,15 @@ pub fn plan(
         let mut minimiser = Minimiser::new(&problem, &start);
         minimiser.curvature = search.curvature;
         let began = budget.spent();
-        let outcome = two_passes(&mut minimiser, &search.schedule, &mut |progress| {
+        let mut watcher = |progress: &Progress| {
             watch(&Report { guess, refinement: false, progress: progress.clone() }) && budget.is_left()
-        });
+        };
+        let outcome = if problem.contacts.is_empty() {
+            // Without contact unknowns there is nothing to relax: only the barrier goes to zero.
+            second_pass(&mut minimiser, &search.schedule, KAPPA_STANDING, &mut watcher)
+        } else {
+            two_passes(&mut minimiser, &search.schedule, &mut watcher)
+        };
         let attempt = attempt_of(&problem, guess, &outcome, budget.spent() - began);
         let better = best.as_ref().is_none_or(|(_, other)| is_better(&attempt, other));
         attempts.push(attempt.clone());
@@ -134,29 +143,45 @@ pub fn plan(
         return Err(PlanError::OutOfRange { key: "guesses", value: 0.0, rule: "at least 1" });
     };
     let mut problem = problem;
-    if let Some(stages) = search.refine_to.filter(|&stages| stages > task.stages) {
+    for stages in levels(task.stages, search.refine_to)? {
         let fine = Task { stages, ..task.clone() }.problem()?;
-        let Some(start) = refine(&problem, &x, &fine) else {
-            return Err(PlanError::OutOfRange {
-                key: "refine_to",
-                value: stages as f64,
-                rule: "a multiple of the stages",
-            });
-        };
+        let Some(start) = refine(&problem, &x, &fine) else { break };
         let mut minimiser = Minimiser::new(&fine, &start);
         minimiser.curvature = search.curvature;
         let began = budget.spent();
         let guess = kept.guess;
-        let outcome =
-            second_pass(&mut minimiser, &search.schedule, search.schedule.kappa_between, &mut |progress| {
-                watch(&Report { guess, refinement: true, progress: progress.clone() }) && budget.is_left()
-            });
+        let schedule = &search.schedule;
+        let outcome = second_pass(&mut minimiser, schedule, schedule.kappa_refined, &mut |progress| {
+            watch(&Report { guess, refinement: true, progress: progress.clone() }) && budget.is_left()
+        });
         kept = attempt_of(&fine, guess, &outcome, budget.spent() - began);
         attempts.push(kept.clone());
         x = minimiser.x;
         problem = fine;
+        if !budget.is_left() {
+            break;
+        }
     }
     finish(task, name, search, &problem, &x, &kept, attempts)
+}
+
+/// Numbers of stages on the way to the refined plan: doubled as long as that divides it.
+fn levels(stages: usize, refine_to: Option<usize>) -> Result<Vec<usize>, PlanError> {
+    let Some(last) = refine_to.filter(|&last| last > stages) else { return Ok(Vec::new()) };
+    if !last.is_multiple_of(stages) {
+        return Err(PlanError::OutOfRange {
+            key: "plan.refine_stages",
+            value: last as f64,
+            rule: "a multiple of plan.stages",
+        });
+    }
+    let mut list = Vec::new();
+    let mut now = stages;
+    while now < last {
+        now = if last.is_multiple_of(2 * now) { 2 * now } else { last };
+        list.push(now);
+    }
+    Ok(list)
 }
 
 fn finish(
@@ -172,10 +197,21 @@ fn finish(
     let mut minimiser = Minimiser::new(problem, x);
     // Removing a large residual would move everything else.
     if kept.violation < PROJECTABLE {
-        minimiser.project(homotopy, 3)?;
+        minimiser.project(homotopy, 4)?;
     }
     minimiser.evaluate(homotopy);
     let mut plan = Plan::from_vector(problem, &minimiser.x, name, kept.kappa);
+    plan.task = json!({
+        "distance_m": task.distance_m,
+        "speed_m_s": [task.speed_m_s.0, task.speed_m_s.1],
+        "torque_fraction": task.torque_fraction,
+        "execution": task.execution.is_some(),
+    });
+    plan.standing = task.standing.as_ref().map(|standing| standing.sole.clone());
+    if let Some((hand, target)) = &task.reach {
+        plan.task["hand"] = json!(hand.name);
+        plan.task["target_m"] = json!(target);
+    }
     let findings = check(&plan, &task.robot)?;
     plan.residual = match serde_json::to_value(&findings) {
         Ok(serde_json::Value::Object(map)) => map,
@@ -186,12 +222,6 @@ fn finish(
     } else {
         format!("NOT CONVERGED: {}", kept.trouble)
     };
-    plan.task = json!({
-        "distance_m": task.distance_m,
-        "speed_m_s": [task.speed_m_s.0, task.speed_m_s.1],
-        "torque_fraction": task.torque_fraction,
-        "execution": task.execution.is_some(),
-    });
     plan.provenance = json!({
         "program": concat!("delmpc-planner ", env!("CARGO_PKG_VERSION")),
         "seed": search.seed,

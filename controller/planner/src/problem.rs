@@ -36,6 +36,17 @@ pub struct LinearRow {
     pub constant: f64,
 }
 
+/// A point that should be at a place at the end: `weight |x(q_N) - target|²`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Reach {
+    /// The point.
+    pub point: BodyPoint,
+    /// Where it should be, m.
+    pub target: [f64; 3],
+    /// Weight, 1/m².
+    pub weight: f64,
+}
+
 /// A planning problem.
 #[derive(Clone, Debug)]
 pub struct Problem {
@@ -67,6 +78,8 @@ pub struct Problem {
     pub cost: Vec<Square>,
     /// Cost of the last stage's end.
     pub terminal: Vec<Square>,
+    /// A point to bring somewhere.
+    pub reach: Option<Reach>,
     /// Further rows of every stage.
     pub rows: Vec<LinearRow>,
     /// Lower bound of every unknown of a plan vector.
@@ -95,6 +108,8 @@ pub struct Blueprint {
     pub clearance: Vec<BodyPoint>,
     /// Largest speed of approach before an impact, m/s.
     pub touchdown_speed: Option<f64>,
+    /// Whether the base is held by a sole on the ground ([`PlanRobot::standing`]).
+    pub standing: bool,
 }
 
 impl Problem {
@@ -103,7 +118,8 @@ impl Problem {
     /// # Errors
     /// [`PlanError`] for a robot that the node recursions do not handle or numbers out of range.
     pub fn new(blueprint: Blueprint) -> Result<Self, PlanError> {
-        let Blueprint { robot, terrain, friction, stages, horizon_s, clearance, touchdown_speed } = blueprint;
+        let Blueprint { robot, terrain, friction, stages, horizon_s, clearance, touchdown_speed, standing } =
+            blueprint;
         if stages < 2 {
             return Err(PlanError::OutOfRange {
                 key: "plan.stages",
@@ -122,7 +138,13 @@ impl Problem {
             touchdown_speed,
         };
         let contacts = robot.contacts.clone();
-        let layout = Layout::new(robot.dof(), robot.actuated.len(), contacts.len(), law.impulses(), 0);
+        let layout = Layout::new(
+            robot.dof(),
+            robot.actuated.len(),
+            contacts.len(),
+            law.impulses(),
+            if standing { 18 } else { 0 },
+        );
         let mean = horizon_s / stages as f64;
         let unit_ns = model.total_mass() * model.gravity() * mean;
         let mut scale = vec![1.0; layout.stage];
@@ -147,6 +169,7 @@ impl Problem {
             row_scale: vec![1.0 / unit_ns; layout.n],
             cost: Vec::new(),
             terminal: Vec::new(),
+            reach: None,
             rows: Vec::new(),
             lower: vec![f64::NEG_INFINITY; size],
             upper: vec![f64::INFINITY; size],
@@ -162,6 +185,17 @@ impl Problem {
                     problem.lower[at + problem.law.normal(node) - problem.law.first_impulse()] = 0.0;
                     let slip = at + problem.law.slip(node) - problem.law.first_impulse();
                     (problem.lower[slip], problem.upper[slip]) = (0.0, LARGEST_SLIP_M);
+                }
+            }
+        }
+        if standing {
+            for k in 0..=stages {
+                for j in 0..6 {
+                    problem.fix(problem.boundary(k) + j, 0.0);
+                    problem.fix(problem.boundary(k) + layout.n + j, 0.0);
+                    if k < stages {
+                        problem.fix(layout.inner_at(k) + j, 0.0);
+                    }
                 }
             }
         }

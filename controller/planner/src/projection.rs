@@ -15,7 +15,7 @@ use crate::error::PlanError;
 use crate::newton::Minimiser;
 
 /// Penalty of the method of multipliers.
-const PENALTY: f64 = 1e-6;
+const PENALTY: f64 = 1e-9;
 /// Rounds of the method of multipliers in each Newton step.
 const ROUNDS: usize = 6;
 /// Freedom of torques, velocities, positions.
@@ -70,8 +70,8 @@ impl Minimiser<'_> {
             .map_err(|stage| PlanError::Indefinite { regularisation: 0.0, stage })?;
         let mut total = vec![0.0; size];
         let mut multipliers = vec![0.0; stages * equalities];
-        for _ in 0..ROUNDS {
-            // The step that remains: residual rows c + J dx, gradient W dx + Jᵀ(λ + rows/δ).
+        for round in 0..ROUNDS {
+            // The step that remains: gradient W dx + Jᵀ(λ + (c + J dx)/δ).
             let mut right: Vec<f64> = total.iter().zip(&diagonal).map(|(dx, w)| -dx * w).collect();
             for k in 0..stages {
                 let lambda = &mut multipliers[k * equalities..(k + 1) * equalities];
@@ -80,8 +80,11 @@ impl Minimiser<'_> {
                 self.derivatives[k].product(problem, &self.supports, &self.z, &mut self.rows);
                 self.rows[equalities..].fill(0.0);
                 for r in 0..equalities {
-                    lambda[r] += (self.rows[r] + self.values[k].rows[r]) / PENALTY;
-                    self.rows[r] = -lambda[r];
+                    let pull = (self.rows[r] + self.values[k].rows[r]) / PENALTY;
+                    if round > 0 {
+                        lambda[r] += pull;
+                    }
+                    self.rows[r] = -(lambda[r] + pull);
                 }
                 self.z.fill(0.0);
                 self.derivatives[k].transposed(problem, &self.supports, &self.rows, &mut self.z);
@@ -118,6 +121,7 @@ impl Minimiser<'_> {
             let at = layout.inner_at(k);
             freedom[at..at + layout.n].fill(FREEDOM[2]);
             freedom[at + layout.n..at + layout.n + layout.inputs].fill(FREEDOM[0]);
+            freedom[at + layout.sole(0)..at + layout.sole(0) + layout.wrench].fill(1.0);
             for i in 0..layout.contacts {
                 let at = at + layout.contact(i);
                 for node in 0..3 {

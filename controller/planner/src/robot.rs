@@ -51,6 +51,8 @@ pub struct PlanRobot {
     pub foot_of_contact: Vec<usize>,
     /// Named postures.
     pub postures: Vec<(String, Vec<f64>)>,
+    /// Named frames: origins only.
+    pub frames: Vec<BodyPoint>,
 }
 
 impl PlanRobot {
@@ -96,6 +98,18 @@ impl PlanRobot {
                 })
             })
             .collect();
+        let frames = model
+            .frames
+            .iter()
+            .filter_map(|frame| {
+                Some(BodyPoint {
+                    name: frame.name.clone(),
+                    body: frame.attachment.body? + offset,
+                    point: frame.attachment.pose.translation.into(),
+                    radius: 0.0,
+                })
+            })
+            .collect();
         let postures = model
             .postures
             .iter()
@@ -120,7 +134,43 @@ impl PlanRobot {
             contacts,
             foot_of_contact,
             postures,
+            frames,
         })
+    }
+
+    /// Takes a robot that stands on one sole and stays there: rooted at the sole's frame, which is {0}.
+    ///
+    /// The foot hangs on six virtual joints that a plan holds at zero: their DEL rows are the momentum balance of the whole
+    /// robot, and what holds them is the wrench of the ground on the sole. The robot has no contact points then.
+    ///
+    /// # Errors
+    /// [`PlanError::UnknownName`] for a sole that the robot does not have, [`PlanError::Mechanics`] when the tree is refused.
+    pub fn standing(model: &RobotModel, sole: &str) -> Result<Self, PlanError> {
+        let frame =
+            model.sole(sole).map(|sole| sole.frame.clone()).ok_or_else(|| PlanError::UnknownName {
+                kind: "sole",
+                name: sole.to_owned(),
+                known: model.soles.iter().map(|sole| sole.name.as_str()).collect::<Vec<_>>().join(", "),
+            })?;
+        let rooted = model.rooted_at(&frame).map_err(|error| PlanError::Mechanics(error.to_string()))?.model;
+        let mut robot = Self::new(&rooted)?;
+        robot.tree = on_a_held_foot(&rooted.tree)?;
+        robot.coordinates =
+            FLOATING_BASE.iter().map(|&name| name.to_owned()).chain(robot.coordinates).collect();
+        robot.limits = [JointLimits::NONE; 6].into_iter().chain(robot.limits).collect();
+        robot.base_coordinates = 6;
+        robot.contacts.clear();
+        robot.foot_of_contact.clear();
+        for index in &mut robot.actuated {
+            *index += 6;
+        }
+        for frame in &mut robot.frames {
+            frame.body += 6;
+        }
+        for (_, q) in &mut robot.postures {
+            q.splice(0..0, [0.0; 6]);
+        }
+        Ok(robot)
     }
 
     /// Number of coordinates.
@@ -137,6 +187,18 @@ impl PlanRobot {
             kind: "coordinate",
             name: name.to_owned(),
             known: self.coordinates.join(", "),
+        })
+    }
+
+    /// A frame by name.
+    ///
+    /// # Errors
+    /// [`PlanError::UnknownName`] with the names there are.
+    pub fn frame(&self, name: &str) -> Result<&BodyPoint, PlanError> {
+        self.frames.iter().find(|frame| frame.name == name).ok_or_else(|| PlanError::UnknownName {
+            kind: "frame",
+            name: name.to_owned(),
+            known: self.frames.iter().map(|frame| frame.name.as_str()).collect::<Vec<_>>().join(", "),
         })
     }
 
@@ -205,10 +267,34 @@ pub fn base_coordinates_of(pose: &RigidTransform) -> [f64; 6] {
     [t.x, t.y, t.z, yaw, pitch, roll]
 }
 
+/// A tree fixed at its foot, the foot on six virtual joints with what is welded to {0} as its mass.
+fn on_a_held_foot(tree: &KinematicTree) -> Result<KinematicTree, PlanError> {
+    let ground = tree.ground_inertia_w();
+    let mass = ground.mass;
+    let com = if mass > 0.0 { ground.first_moment / mass } else { Vector3::zeros() };
+    let central = ground.rotational - (Matrix3::identity() * com.dot(&com) - com * com.transpose()) * mass;
+    let foot = LinkInertia { mass, com, inertia: 0.5 * (central + central.transpose()) };
+    let mut builder = TreeBuilder::fixed_base(*tree.gravity_w());
+    builder.accept_unreal_inertia();
+    add_virtual_joints(&mut builder, foot);
+    for body in tree.bodies() {
+        builder.add(Body { parent: Some(body.parent.map_or(5, |parent| parent + 6)), ..*body });
+    }
+    builder.build().map_err(|error| PlanError::Mechanics(error.to_string()))
+}
+
 /// The floating base as six virtual joints; bodies keep their order after them.
 fn with_virtual_joints(tree: &KinematicTree) -> Result<KinematicTree, PlanError> {
     let mut builder = TreeBuilder::fixed_base(*tree.gravity_w());
     builder.accept_unreal_inertia();
+    add_virtual_joints(&mut builder, tree.bodies()[0].inertia);
+    for body in &tree.bodies()[1..] {
+        builder.add(Body { parent: body.parent.map(|parent| parent + 5), ..*body });
+    }
+    builder.build().map_err(|error| PlanError::Mechanics(error.to_string()))
+}
+
+fn add_virtual_joints(builder: &mut TreeBuilder, last: LinkInertia) {
     let massless = LinkInertia { mass: 0.0, com: Vector3::zeros(), inertia: Matrix3::zeros() };
     let here = RigidTransform::identity();
     let joints = [
@@ -220,11 +306,7 @@ fn with_virtual_joints(tree: &KinematicTree) -> Result<KinematicTree, PlanError>
         Joint::revolute(Vector3::x(), here),
     ];
     for (index, joint) in joints.into_iter().enumerate() {
-        let inertia = if index == 5 { tree.bodies()[0].inertia } else { massless };
+        let inertia = if index == 5 { last } else { massless };
         builder.add(Body::new(index.checked_sub(1), joint, inertia));
     }
-    for body in &tree.bodies()[1..] {
-        builder.add(Body { parent: body.parent.map(|parent| parent + 5), ..*body });
-    }
-    builder.build().map_err(|error| PlanError::Mechanics(error.to_string()))
 }

@@ -119,6 +119,11 @@ impl Engine {
         self.clearance(problem, homotopy, out);
         plain_rows(problem, z, &mut out.rows);
         out.cost = cost(problem, z, last);
+        if let Some(reach) = problem.reach.as_ref().filter(|_| last) {
+            let x = position(&self.nodes.bodies[reach.point.body], &reach.point.point);
+            let square: f64 = (0..3).map(|a| (x[a].0[2] - reach.target[a]).powi(2)).sum();
+            out.cost += reach.weight * square;
+        }
     }
 
     fn load(&mut self, problem: &Problem, z: &[f64]) {
@@ -225,6 +230,13 @@ pub(crate) fn del_rows(
         }
         del[j] += by_rate[j].0[3];
         del[2 * n + j] -= by_rate[j].0[4];
+    }
+    if layout.wrench > 0 {
+        for alpha in 0..3 {
+            for j in 0..6 {
+                del[alpha * n + j] += problem.unit_ns * z[layout.sole(alpha) + j];
+            }
+        }
     }
     for (input, &j) in problem.robot.actuated.iter().enumerate() {
         for alpha in 0..3 {

@@ -137,6 +137,40 @@ impl Engine {
         }
         plain_rows(problem, z, &mut values.rows);
         values.cost = add_cost(problem, z, last, out);
+        if last {
+            values.cost += self.reach(problem, out);
+        }
+    }
+
+    /// The cost of a point away from where it should be at the end.
+    fn reach(&self, problem: &Problem, out: &mut StageDerivatives) -> f64 {
+        let Some(reach) = &problem.reach else { return 0.0 };
+        let layout = &problem.layout;
+        let body = reach.point.body;
+        let x = position(&self.duals.bodies[body], &reach.point.point);
+        let away = [0, 1, 2].map(|axis| x[axis].re.0[2] - reach.target[axis]);
+        let mut force = [Dual::ZERO; 3];
+        for axis in 0..3 {
+            force[axis].re.0[2] = 2.0 * reach.weight * away[axis];
+        }
+        let branch = problem.model.branch(body);
+        let gradients: Vec<[f64; 3]> = branch
+            .iter()
+            .map(|&k| gradient(&self.duals.bodies[k].twist, x).map(|component| component.re.0[2]))
+            .collect();
+        for (a, &j) in branch.iter().enumerate() {
+            let dot = |v: &[f64; 3]| (0..3).map(|axis| gradients[a][axis] * v[axis]).sum::<f64>();
+            out.cost_gradient[layout.q(1, j)] += 2.0 * reach.weight * dot(&away);
+            for (b, &k) in branch.iter().enumerate().take(a + 1) {
+                out.add(layout.q(1, j), layout.q(1, k), 2.0 * reach.weight * dot(&gradients[b]));
+            }
+        }
+        let mut contraction = Contraction::<Dual>::NONE;
+        contraction.add(x, force);
+        contraction.pairs(&problem.model, &self.duals.bodies, body, |j, k, value| {
+            out.add(layout.q(1, j), layout.q(1, k), value.re.0[2]);
+        });
+        reach.weight * away.iter().map(|x| x * x).sum::<f64>()
     }
 
     /// Lanes with the directions of the table in [`crate::stage`]; the weights of the DEL rows are `-l` times their scale.
@@ -251,6 +285,13 @@ impl Engine {
         let mut input_of = vec![None; n];
         for (input, &j) in problem.robot.actuated.iter().enumerate() {
             input_of[j] = Some(layout.input(input));
+        }
+        if layout.wrench > 0 {
+            for alpha in 0..3 {
+                for j in 0..6 {
+                    out.panel[(alpha * n + j) * out.ld + layout.sole(alpha) + j] += problem.unit_ns;
+                }
+            }
         }
         let mut time_time = 0.0;
         for j in 0..n {

@@ -63,9 +63,23 @@ impl Default for PlanWeights {
 pub struct ExecutionLimits {
     /// Largest speed of approach of a contact point at the end of a stage, m/s.
     pub touchdown_speed_m_s: f64,
-    /// Largest impulse of a contact at the end of a stage, units of S.
-    pub impact_impulse: f64,
+    /// Largest impulse of a contact at the end of a stage, N s. Standing there needs a sixth of the stage's load.
+    pub impact_impulse_ns: f64,
 }
+
+/// A flat sole on the ground, and how much of it a plan uses.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Standing {
+    /// The sole's name.
+    pub sole: String,
+    /// Box within the sole's polygon for the pressure point, in the sole's frame: least and largest x, y, m.
+    pub pressure_m: [[f64; 2]; 2],
+    /// Yaw torque per vertical force, m.
+    pub yaw_arm_m: f64,
+}
+
+/// Weight of a hand away from its target, 1/m².
+const REACH_WEIGHT: f64 = 2e4;
 
 /// Base motion is bounded to this box around the start, so that the chart of the base stays regular.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -113,6 +127,10 @@ pub struct Task {
     pub alike: Vec<(usize, usize)>,
     /// Rows for execution.
     pub execution: Option<ExecutionLimits>,
+    /// The sole that it stands on ([`PlanRobot::standing`]); none for robots with contact points.
+    pub standing: Option<Standing>,
+    /// A point of the robot and where it should be at the end.
+    pub reach: Option<(BodyPoint, [f64; 3])>,
     /// How far the base of the guess is raised above the start posture in the middle of the motion, m.
     pub guess_lift_m: f64,
 }
@@ -145,6 +163,7 @@ impl Task {
             horizon_s: self.horizon_s,
             clearance: self.clearance.clone(),
             touchdown_speed: self.execution.map(|limits| limits.touchdown_speed_m_s),
+            standing: self.standing.is_some(),
         })?;
         self.scale_rows(&mut problem)?;
         self.add_bounds(&mut problem);
@@ -152,6 +171,14 @@ impl Task {
         if let Some(limits) = self.execution {
             self.add_execution_rows(&mut problem, limits);
         }
+        if let Some(standing) = &self.standing {
+            self.add_sole_rows(&mut problem, standing);
+        }
+        problem.reach = self.reach.as_ref().map(|(point, target)| crate::problem::Reach {
+            point: point.clone(),
+            target: *target,
+            weight: REACH_WEIGHT,
+        });
         let velocity = self.start_velocity()?;
         problem.fix_start(&self.start, &velocity);
         Ok(problem)
@@ -168,11 +195,7 @@ impl Task {
         let diagonal = mass_diagonal(&self.robot, &self.start)?;
         let mass = problem.model.total_mass();
         for j in 0..n {
-            let factor = if j < self.robot.base_coordinates || self.robot.planar {
-                1.0
-            } else {
-                (mass / diagonal[j]).sqrt().clamp(1.0, 30.0)
-            };
+            let factor = if self.robot.planar { 1.0 } else { (mass / diagonal[j]).sqrt().clamp(1.0, 30.0) };
             problem.row_scale[j] = factor / problem.unit_ns;
         }
         for input in 0..problem.layout.inputs {
@@ -258,6 +281,19 @@ impl Task {
             }
         }
         let goal = self.goal();
+        if self.standing.is_some() {
+            // A hand that reaches decides the posture; the robot comes to rest.
+            for j in robot.base_coordinates..robot.dof() {
+                let rest = Square {
+                    form: vec![(layout.v(1, j), 1.0)],
+                    target: 0.0,
+                    weight: w.end_joint_rate,
+                    per_time: false,
+                };
+                problem.terminal.push(rest);
+            }
+            return;
+        }
         for j in 0..robot.dof() {
             let base = j < robot.base_coordinates;
             let speed = if robot.coordinates[j] == "base_x" { self.speed_m_s.1 } else { 0.0 };
@@ -273,6 +309,30 @@ impl Task {
         }
     }
 
+    /// Wrench of the ground on the sole at every node: unilateral, friction, pressure point, yaw.
+    fn add_sole_rows(&self, problem: &mut Problem, standing: &Standing) {
+        let [[x_min, x_max], [y_min, y_max]] = standing.pressure_m;
+        // Half of the square inscribed in the friction circle.
+        let slope = self.friction * std::f64::consts::FRAC_1_SQRT_2;
+        for node in 0..3 {
+            let at = problem.layout.sole(node);
+            // Order of the virtual joints: forces along x, y, z, torques about z, y, x.
+            let (fx, fy, fz, mz, my, mx) = (at, at + 1, at + 2, at + 3, at + 4, at + 5);
+            let mut row = |form: Vec<(usize, f64)>| problem.rows.push(LinearRow { form, constant: 0.0 });
+            row(vec![(fz, 1.0)]);
+            for sign in [1.0, -1.0] {
+                row(vec![(fz, slope), (fx, sign)]);
+                row(vec![(fz, slope), (fy, sign)]);
+                row(vec![(fz, standing.yaw_arm_m), (mz, sign)]);
+            }
+            // Pressure point (-M_y, M_x)/f_z.
+            row(vec![(fz, x_max), (my, 1.0)]);
+            row(vec![(fz, -x_min), (my, -1.0)]);
+            row(vec![(fz, y_max), (mx, -1.0)]);
+            row(vec![(fz, -y_min), (mx, 1.0)]);
+        }
+    }
+
     /// Impact impulse and joint rates before an impact: `|q^0 - 4 q^½ + 3 q^1| <= limit Δt`.
     fn add_execution_rows(&self, problem: &mut Problem, limits: ExecutionLimits) {
         let layout = problem.layout;
@@ -280,7 +340,7 @@ impl Task {
         for k in 0..problem.stages {
             for i in 0..layout.contacts {
                 let at = layout.inner_at(k) + layout.contact(i) + law.normal(2) - law.first_impulse();
-                problem.upper[at] = limits.impact_impulse;
+                problem.upper[at] = limits.impact_impulse_ns / problem.unit_ns;
             }
         }
         for &j in &self.robot.actuated {
@@ -393,6 +453,11 @@ impl Task {
             let at = layout.inner_at(k);
             for j in 0..n {
                 guess[at + j] = state(s + 0.5 / stages as f64, j);
+            }
+            for node in 0..3 {
+                if layout.wrench > 0 {
+                    guess[at + layout.sole(node) + 2] = crate::stage::WEIGHTS[node];
+                }
             }
             for i in 0..problem.contacts.len() {
                 for node in 0..3 {

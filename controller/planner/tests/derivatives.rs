@@ -14,8 +14,8 @@ fn point(task: &Task, problem: &Problem) -> Vec<f64> {
     let mut next = common::random(3);
     let mut x = task.guess(problem, |_, _| 0.0);
     let scale = if task.robot.planar { 0.1 } else { 0.02 };
-    for value in &mut x {
-        *value += scale * next();
+    for (i, value) in x.iter_mut().enumerate() {
+        *value += if problem.is_fixed(i) { 0.0 } else { scale * next() };
     }
     for k in 0..=problem.stages {
         x[problem.boundary(k) + 2 * problem.layout.n] = task.horizon_s * k as f64 / problem.stages as f64;
@@ -24,7 +24,8 @@ fn point(task: &Task, problem: &Problem) -> Vec<f64> {
 }
 
 fn check(mut task: Task, execution: bool) {
-    task.execution = execution.then_some(ExecutionLimits { touchdown_speed_m_s: 1.5, impact_impulse: 0.4 });
+    task.execution =
+        execution.then_some(ExecutionLimits { touchdown_speed_m_s: 1.5, impact_impulse_ns: 5.0 });
     let problem = task.problem().unwrap();
     let homotopy = Homotopy { kappa: 0.3, sigma: 0.7 };
     let barrier = Barrier { mu: 0.05, delta: 0.1 };
@@ -97,4 +98,9 @@ fn flamingo_with_execution_rows() {
 #[test]
 fn littledog() {
     check(common::littledog_gaps(3), false);
+}
+
+#[test]
+fn atlas_on_one_foot() {
+    check(common::atlas_pick([0.8, 0.3, 0.5], 1.3, 3), false);
 }

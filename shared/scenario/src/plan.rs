@@ -42,14 +42,22 @@ pub struct PlanSettings {
     pub execution: bool,
     /// Largest speed of a contact point before it touches down, m/s (with `execution`).
     pub touchdown_speed_m_s: f64,
-    /// Largest impulse of a contact at the end of a stage, in stages of weight (with `execution`).
-    pub impact_impulse: f64,
+    /// Largest impulse of a contact at the end of a stage, N s (with `execution`).
+    pub impact_impulse_ns: f64,
     /// Distance that footholds keep from edges, m.
     pub edge_margin_m: f64,
     /// Height by which legs clear obstacles, m.
     pub obstacle_margin_m: f64,
     /// Points of soles and of shanks that keep clear of ground and obstacles; 0: none.
     pub outline_points: [usize; 2],
+    /// Frame that reaches for a target, for a robot that stands on its stance sole throughout; empty: none.
+    pub hand: String,
+    /// Where that frame should be at the end, in the frame of the stance sole, m.
+    pub target_m: [f64; 3],
+    /// Distance that the pressure point keeps from the edge of the sole, m (with `hand`).
+    pub cop_margin_m: f64,
+    /// Yaw torque that the sole takes per vertical force, m (with `hand`).
+    pub yaw_arm_m: f64,
     /// Obstacles, cleared and never stood on: a table `[plan.obstacle]` or a list.
     #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
     pub obstacle: Vec<PlanObstacle>,
@@ -195,10 +203,14 @@ impl Default for PlanSettings {
             guess_lift_m: 0.05,
             execution: false,
             touchdown_speed_m_s: 1.5,
-            impact_impulse: 0.3,
+            impact_impulse_ns: 6.0,
             edge_margin_m: 0.015,
             obstacle_margin_m: 0.04,
             outline_points: [0, 0],
+            hand: String::new(),
+            target_m: [0.0; 3],
+            cop_margin_m: 0.01,
+            yaw_arm_m: 0.05,
             obstacle: Vec::new(),
             gap: Vec::new(),
             step: Vec::new(),
@@ -244,11 +256,14 @@ impl PlanSettings {
             ("plan.base_height_m", self.base_height_m[1], self.base_height_m[0], 100.0),
             ("plan.guess_lift_m", self.guess_lift_m, 0.0, 10.0),
             ("plan.touchdown_speed_m_s", self.touchdown_speed_m_s, 0.01, 100.0),
-            ("plan.impact_impulse", self.impact_impulse, 0.01, 100.0),
+            ("plan.impact_impulse_ns", self.impact_impulse_ns, 1e-3, 1e4),
             ("plan.edge_margin_m", self.edge_margin_m, 0.0, 1.0),
             ("plan.obstacle_margin_m", self.obstacle_margin_m, 0.0, 1.0),
             ("plan.outline_points", self.outline_points[0] as f64, 0.0, 100.0),
             ("plan.outline_points", self.outline_points[1] as f64, 0.0, 100.0),
+            ("plan.target_m", self.target_m.iter().fold(0.0, |worst: f64, x| worst.max(x.abs())), 0.0, 100.0),
+            ("plan.cop_margin_m", self.cop_margin_m, 0.0, 1.0),
+            ("plan.yaw_arm_m", self.yaw_arm_m, 1e-4, 10.0),
             ("plan.weights.torque_nm", w.torque_nm, 1e-6, 1e9),
             weight("plan.weights.joint_rate_s2_per_rad2", w.joint_rate_s2_per_rad2),
             weight("plan.weights.legs_alike_per_rad2", w.legs_alike_per_rad2),

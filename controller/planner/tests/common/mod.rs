@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use delmpc_planner::outline::leg_outline;
 use delmpc_planner::robot::PlanRobot;
-use delmpc_planner::task::{BaseBounds, PlanWeights, Task};
+use delmpc_planner::task::{BaseBounds, PlanWeights, Standing, Task};
 use delmpc_planner::terrain::{Gap, Obstacle, Terrain};
 
 pub fn robot(name: &str) -> PlanRobot {
@@ -43,6 +43,8 @@ pub fn flamingo_jump(stages: usize) -> Task {
         weights: PlanWeights { legs_alike: 1.0, steady_speed: 0.2, ..PlanWeights::default() },
         alike,
         execution: None,
+        standing: None,
+        reach: None,
         guess_lift_m: 0.05,
         robot,
     }
@@ -78,7 +80,49 @@ pub fn littledog_gaps(stages: usize) -> Task {
         },
         alike: Vec::new(),
         execution: None,
+        standing: None,
+        reach: None,
         guess_lift_m: 0.01,
+        robot,
+    }
+}
+
+/// Atlas on its right foot fetches a ball.
+pub fn atlas_pick(ball: [f64; 3], horizon_s: f64, stages: usize) -> Task {
+    let root = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../configs/robots/atlas.urdf");
+    let robot = PlanRobot::standing(&delmpc_robots::load(root).unwrap(), "right").unwrap();
+    let start = robot.posture("one_foot_right").unwrap().to_vec();
+    let hand = robot.frames.iter().find(|frame| frame.name == "l_hand_point").unwrap().clone();
+    Task {
+        terrain: Terrain::flat(),
+        stages,
+        horizon_s,
+        distance_m: 0.0,
+        speed_m_s: (0.0, 0.0),
+        start,
+        friction: 0.5,
+        torque_fraction: 0.95,
+        torque_limit_nm: 100.0,
+        rate_limit: 12.0,
+        bounds: Vec::new(),
+        base: BaseBounds { attitude_rad: 0.5, height_m: (-1.0, 1.0) },
+        clearance: Vec::new(),
+        weights: PlanWeights {
+            torque_nm: 100.0,
+            posture: 1.0,
+            joint_rate: 1e-2,
+            end_joint_rate: 1e3,
+            ..PlanWeights::default()
+        },
+        alike: Vec::new(),
+        execution: None,
+        standing: Some(Standing {
+            sole: "right".to_owned(),
+            pressure_m: [[-0.12, 0.12], [-0.054, 0.054]],
+            yaw_arm_m: 0.05,
+        }),
+        reach: Some((hand, ball)),
+        guess_lift_m: 0.0,
         robot,
     }
 }
