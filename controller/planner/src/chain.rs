@@ -124,3 +124,66 @@ fn put(layout: &Layout, stages: usize, k: usize, z: &[f64], plan: &mut [f64]) {
     let at = layout.boundary_at(stages, k);
     plan[at..at + 2 * layout.boundary].copy_from_slice(ends);
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{DMatrix, DVector};
+
+    use super::*;
+
+    #[test]
+    fn solves_what_a_dense_cholesky_solves() {
+        let layout = Layout::new(3, 2, 1, 4, 0);
+        let (stages, ld, size) = (4, padded(layout.stage), layout.plan(4));
+        let mut state = 7u64;
+        let mut next = move || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
+        };
+        let mut dense = DMatrix::<f64>::zeros(size, size);
+        let mut matrices = Vec::new();
+        for k in 0..stages {
+            let root = DMatrix::from_fn(layout.stage, layout.stage, |_, _| next());
+            let block = &root * root.transpose();
+            let index = |i: usize| {
+                if i < layout.inner {
+                    layout.inner_at(k) + i
+                } else {
+                    layout.boundary_at(stages, k) + i - layout.inner
+                }
+            };
+            let mut a = vec![0.0; ld * layout.stage];
+            for j in 0..layout.stage {
+                for i in j..layout.stage {
+                    a[j * ld + i] = block[(i, j)];
+                }
+                for i in 0..layout.stage {
+                    dense[(index(i), index(j))] += block[(i, j)];
+                }
+            }
+            matrices.push(a);
+        }
+        let diagonal: Vec<f64> = (0..size).map(|i| 0.1 + 0.01 * i as f64).collect();
+        let mut fixed = vec![false; size];
+        for i in [layout.boundary_at(stages, 0), layout.boundary_at(stages, 2) + 1, size - 1] {
+            fixed[i] = true;
+        }
+        for i in 0..size {
+            dense[(i, i)] += diagonal[i];
+            if fixed[i] {
+                dense.row_mut(i).fill(0.0);
+                dense.column_mut(i).fill(0.0);
+                dense[(i, i)] = 1.0;
+            }
+        }
+        let right = DVector::from_fn(size, |i, _| if fixed[i] { 0.0 } else { (i as f64).sin() });
+        let expected = dense.cholesky().unwrap().solve(&right);
+        let mut chain = Chain::new(Arch::new(), layout, stages);
+        chain.factorise(|k| matrices[k].as_slice(), &diagonal, &fixed).unwrap();
+        let mut x = right.as_slice().to_vec();
+        chain.solve(&mut x);
+        for (got, want) in x.iter().zip(expected.iter()) {
+            assert!((got - want).abs() < 1e-9 * (1.0 + want.abs()), "{got} {want}");
+        }
+    }
+}
