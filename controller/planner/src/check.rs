@@ -119,7 +119,7 @@ pub struct Bounds {
 
 impl Default for Bounds {
     fn default() -> Self {
-        Self { del_s: 1e-10, gap_m: 5e-6, cone_s: 1e-6, product_s_m: 2e-5, clearance_m: 0.0 }
+        Self { del_s: 1e-10, gap_m: 5e-6, cone_s: 5e-6, product_s_m: 2e-5, clearance_m: 0.0 }
     }
 }
 
