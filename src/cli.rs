@@ -6,6 +6,7 @@ use clap::{Args, Parser, Subcommand};
 
 use crate::completions::CompletionsArguments;
 use crate::model::ModelArguments;
+use crate::plan::PlanArguments;
 use crate::push_map::PushMapArguments;
 use crate::replay::ReplayArguments;
 use crate::report::ReportArguments;
@@ -77,6 +78,15 @@ const REPLAY_EXAMPLES: &str = "\
 Examples:
   delmpc run --set clock=lockstep && delmpc replay --verify
   delmpc replay /tmp/try --verify";
+
+const PLAN_EXAMPLES: &str = "\
+Examples:
+  delmpc plan configs/scenarios/flamingo_jump.toml
+  delmpc plan configs/scenarios/flamingo_jump.toml --guesses 4 --out /tmp/jump.json
+  delmpc plan configs/scenarios/littledog_gaps.toml --set plan.friction=0.6
+  delmpc plan --check /tmp/jump.json
+
+Exit status 0 only when the plan converged and every residual, recomputed from the file with the mechanics alone, is within its bound.";
 
 const REPORT_EXAMPLES: &str = "\
 Examples:
@@ -181,6 +191,12 @@ pub enum Command {
     /// The key plots are left as PNG in the folder plots/ beside it. Prints the path of the page.
     #[command(after_long_help = REPORT_EXAMPLES)]
     Report(ReportArguments),
+    /// Plan a motion through contact, nobody names who touches when; or check a plan file
+    ///
+    /// The scenario says robot, ground, way and time in its section [plan]. Left behind is a plan file: times, states, torques,
+    /// impulses and contact sets at every stage.
+    #[command(after_long_help = PLAN_EXAMPLES)]
+    Plan(PlanArguments),
     /// Print the script that makes a shell complete our words
     #[command(after_long_help = COMPLETIONS_EXAMPLES)]
     Completions(CompletionsArguments),

@@ -30,6 +30,7 @@
 //! | [`view`] | the live page: watch, pull, pause |
 //! | [`tape`] | everything that enters the cycles of a run, kept, and given again |
 //! | [`timing`] | the timing of the loop certified: figures, causes of missed deadlines, verdict |
+//! | [`mod@plan`] | a motion planned through contact, or a plan file checked |
 //! | [`status_line`] | one line about the running run |
 
 pub mod cli;
@@ -51,6 +52,7 @@ pub mod observer;
 pub mod one_process;
 pub mod output;
 pub mod part;
+pub mod plan;
 pub mod plant;
 pub mod plant_process;
 pub mod push_map;

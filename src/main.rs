@@ -31,6 +31,7 @@ fn main() -> ExitCode {
         Command::Completions(arguments) => delmpc::completions::completions(&arguments),
         Command::Timing(arguments) => delmpc::timing::timing(&arguments),
         Command::TransportPeer(arguments) => delmpc::timing::transport::transport_peer(&arguments),
+        Command::Plan(arguments) => delmpc::plan::plan(&arguments),
         Command::Report(arguments) => delmpc::report::report(&arguments),
     })
 }

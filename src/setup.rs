@@ -226,7 +226,7 @@ pub fn scenario_file_or(named: Option<&Path>, usual: &str) -> Result<PathBuf, Fa
 }
 
 /// The robot file: relative to the scenario, or else to the working folder.
-fn find_robot(scenario: &Path, urdf: &str) -> PathBuf {
+pub(crate) fn find_robot(scenario: &Path, urdf: &str) -> PathBuf {
     let beside = scenario.parent().unwrap_or(Path::new("")).join(urdf);
     let here = PathBuf::from(urdf);
     if !beside.is_file() && here.is_file() { here } else { beside }

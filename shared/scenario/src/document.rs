@@ -14,7 +14,17 @@ use crate::{Place, Scenario, ScenarioError};
 const LARGEST_FILE: u64 = 1 << 20;
 
 /// Keys that hold one table or a list of tables.
-const LISTS: [&str; 4] = ["push", "fault", "terrain.box", "terrain.gap"];
+const LISTS: [&str; 9] = [
+    "push",
+    "fault",
+    "terrain.box",
+    "terrain.gap",
+    "plan.obstacle",
+    "plan.gap",
+    "plan.step",
+    "plan.spring",
+    "plan.bound",
+];
 
 /// In the catalogue, the name that stands for all names.
 pub(crate) const ANY_NAME: &str = "*";
@@ -262,12 +272,14 @@ impl Document {
     fn unknown(&self, table: &str, key: &str, name: &str, known: &Table) -> ScenarioError {
         let nearest = known
             .keys()
-            .map(|candidate| (edit_distance(name, candidate), candidate))
-            .filter(|(distance, candidate)| {
+            .map(|candidate| {
+                (edit_distance(name, candidate), name.len().abs_diff(candidate.len()), candidate)
+            })
+            .filter(|(distance, _, candidate)| {
                 *distance <= 3.min(candidate.len() / 2).max(1) || starts_alike(name, candidate)
             })
             .min()
-            .map(|(_, candidate)| join(table, candidate));
+            .map(|(.., candidate)| join(table, candidate));
         ScenarioError::UnknownKey {
             file: self.file.clone(),
             place: self.place(key),

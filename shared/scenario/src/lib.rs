@@ -29,12 +29,14 @@ mod document;
 mod error;
 mod fault;
 mod list;
+mod plan;
 mod range;
 mod scenario;
 
 pub use document::Document;
 pub use error::{Place, ScenarioError};
 pub use fault::{FaultKind, FaultSettings, FaultTarget};
+pub use plan::{PlanBound, PlanGap, PlanObstacle, PlanSettings, PlanSpring, PlanStep, PlanWeightSettings};
 pub use scenario::{
     BoxSettings, Clock, ConstraintSettings, ControllerKind, ControllerSettings, GapSettings, PlantSettings,
     ProcessSettings, PushSettings, ReachSettings, RobotSettings, Scenario, SensorSettings, StartSettings,

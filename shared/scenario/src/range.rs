@@ -120,6 +120,10 @@ pub(crate) fn check(scenario: &Scenario) -> Result<(), Violation> {
         within(&key("duration_s"), push.duration_s, plant.step_s, 3600.0)?;
     }
 
+    for (key, value, least, most) in scenario.plan.iter().flat_map(crate::PlanSettings::ranges) {
+        within(key, value, least, most)?;
+    }
+
     for (index, fault) in scenario.fault.iter().enumerate() {
         check_fault(fault, index, scenario.fault.len())?;
     }

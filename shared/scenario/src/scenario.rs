@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::FaultSettings;
+use crate::{FaultSettings, PlanSettings};
 
 /// Everything that decides a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -40,6 +40,9 @@ pub struct Scenario {
     /// Faults on purpose: one table `[fault]` or a list `[[fault]]`.
     #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
     pub fault: Vec<FaultSettings>,
+    /// A motion to be planned through contact.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub plan: Option<PlanSettings>,
     /// What counts as success.
     pub success: SuccessSettings,
     /// What counts as timing kept: `delmpc timing`.
@@ -442,6 +445,7 @@ impl Default for Scenario {
             reach: None,
             push: Vec::new(),
             fault: Vec::new(),
+            plan: None,
             success: SuccessSettings::default(),
             timing: TimingSettings::default(),
         }
@@ -632,6 +636,7 @@ impl Scenario {
                 gaps: vec![GapSettings::default()],
             },
             fault: vec![FaultSettings::default()],
+            plan: Some(PlanSettings::catalogue()),
             timing: TimingSettings {
                 max_misses: Some(0),
                 max_wake_up_p99_s: Some(0.0),
