@@ -31,7 +31,11 @@ fn succeeds(overrides: &[String]) -> Summary {
 fn stands(overrides: &[String]) {
     let summary = run(overrides);
     println!("{overrides:?}: {}", summary.failure.as_deref().unwrap_or("success"));
-    assert!(!summary.plant.as_ref().is_some_and(|plant| plant.robot.fell), "{overrides:?}: {:?}", summary.failure);
+    assert!(
+        !summary.plant.as_ref().is_some_and(|plant| plant.robot.fell),
+        "{overrides:?}: {:?}",
+        summary.failure
+    );
 }
 
 fn slope(degrees: f64, eighth: u32) -> String {
@@ -74,8 +78,7 @@ fn the_estimate_is_good_with_a_biased_gyroscope_and_a_biased_attitude_is_survive
     let summary = run(&with("sensors.gyro_bias_rad_s=8.7e-3"));
     let robot = &summary.plant.as_ref().unwrap().robot;
     assert!(!robot.fell);
-    let (tilt, velocity) =
-        (robot.estimator_tilt_rms_rad.unwrap(), robot.estimator_velocity_rms_m_s.unwrap());
+    let (tilt, velocity) = (robot.estimator_tilt_rms_rad.unwrap(), robot.estimator_velocity_rms_m_s.unwrap());
     println!("tilt {:.3} degrees rms, velocity {velocity:.4} m/s rms", tilt.to_degrees());
     assert!(tilt <= 0.2_f64.to_radians() && velocity <= 0.02);
     stands(&with("sensors.imu_misalignment_rad=[0.0175, 0.0, 0.0]"));

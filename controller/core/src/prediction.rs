@@ -8,7 +8,7 @@
 //! q⁺ = q + Δt q̇ + ½ Δt² q̈        q̇⁺ = q̇ + Δt q̈
 //! ```
 //!
-//! The laws see velocities as the servo does, as means over its last samples: half their time behind.
+//! The laws see velocities as the servo does, as means over its last samples; those before the measurement are the ones predicted then.
 //!
 //! Midpoint rule in position and damping, which may be strong; explicit in the velocity that `c` depends on, of first order there. Over
 //! some milliseconds that costs less accuracy than sensors have, and a third of the time of variational steps. The plan itself is made of
@@ -41,8 +41,11 @@ pub(crate) struct Prediction {
     error: Vec<f64>,
     /// Torque, then acceleration.
     acceleration: Vec<f64>,
-    /// By how much the velocities a law sees are behind, s: those of the servo are means.
-    rate_lag_s: f64,
+    /// The last velocities, those of the servo's mean: rows of a ring, the newest at `newest`.
+    velocities: Vec<f64>,
+    newest: usize,
+    /// Time of the newest one, s of the run.
+    newest_s: f64,
     /// The state as a law sees it.
     seen: Vec<f64>,
 }
@@ -60,7 +63,9 @@ impl Prediction {
             factor: MassMatrixFactor::new(tree),
             error: vec![0.0; 2 * n],
             acceleration: vec![0.0; n],
-            rate_lag_s: 0.5 * f64::from(rate_samples.saturating_sub(1)) * servo_period_s,
+            velocities: vec![0.0; n * rate_samples.max(1) as usize],
+            newest: 0,
+            newest_s: f64::NEG_INFINITY,
             seen: vec![0.0; 2 * n],
         }
     }
@@ -80,18 +85,38 @@ impl Prediction {
     ) -> Result<(), StepError> {
         let steps = libm::ceil(duration_s / self.servo_period_s - 1e-9).max(1.0);
         let time_step = duration_s / steps;
+        let n = self.acceleration.len();
+        if (from_s - self.newest_s).abs() > 0.5 * self.servo_period_s {
+            // Nothing is known of the samples before this one.
+            for row in self.velocities.chunks_exact_mut(n) {
+                row.copy_from_slice(&x[n..]);
+            }
+        }
+        self.velocities[self.newest * n..(self.newest + 1) * n].copy_from_slice(&x[n..]);
         for step in 0..steps as usize {
             let (elapsed_s, law) = laws.at(from_s + step as f64 * time_step);
-            // The acceleration of the step before; of the last prediction at first.
-            let n = self.acceleration.len();
-            self.seen.copy_from_slice(x);
-            for (rate, acceleration) in self.seen[n..].iter_mut().zip(&self.acceleration) {
-                *rate -= self.rate_lag_s * acceleration;
-            }
+            self.see(x);
             law.torque_at(elapsed_s, &self.seen, &mut self.error, &mut self.acceleration);
             self.step(tree, time_step, x)?;
+            self.newest = (self.newest + 1) % (self.velocities.len() / n);
+            self.velocities[self.newest * n..(self.newest + 1) * n].copy_from_slice(&x[n..]);
         }
+        self.newest_s = from_s + duration_s;
         Ok(())
+    }
+
+    /// The state as the servo's law sees it: positions of now, velocities as means.
+    fn see(&mut self, x: &[f64]) {
+        let n = self.acceleration.len();
+        let (positions, rates) = self.seen.split_at_mut(n);
+        positions.copy_from_slice(&x[..n]);
+        rates.fill(0.0);
+        let part = n as f64 / self.velocities.len() as f64;
+        for row in self.velocities.chunks_exact(n) {
+            for (mean, rate) in rates.iter_mut().zip(row) {
+                *mean += part * rate;
+            }
+        }
     }
 
     /// One step under the torque in `acceleration`.

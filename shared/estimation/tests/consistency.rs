@@ -49,7 +49,12 @@ fn sway(time: f64) -> [f64; 2] {
 }
 
 /// The base link in {0}, with the sole at `sole_w`.
-fn base_at(kinematics: &mut Kinematics, model: &EstimatorModel, time: f64, sole_w: &RigidTransform) -> RigidTransform {
+fn base_at(
+    kinematics: &mut Kinematics,
+    model: &EstimatorModel,
+    time: f64,
+    sole_w: &RigidTransform,
+) -> RigidTransform {
     let origin = base_pose_from_link(&model.tree, &RigidTransform::identity());
     kinematics.update_positions(&model.tree, &Configuration::floating(origin, &sway(time))).unwrap();
     *sole_w * (kinematics.link_poses_w()[2] * model.feet[0].sole).inverse()
@@ -80,16 +85,14 @@ fn run(seed: u64, seconds: f64, config: &EstimatorConfig, sole_w: impl Fn(f64) -
     for k in 0..=samples {
         let time = k as f64 * h;
         let pose = |kinematics: &mut Kinematics, time: f64| base_at(kinematics, &model, time, &sole_w(time));
-        let (before, now, after) = (
-            pose(&mut kinematics, time - h),
-            pose(&mut kinematics, time),
-            pose(&mut kinematics, time + h),
-        );
+        let (before, now, after) =
+            (pose(&mut kinematics, time - h), pose(&mut kinematics, time), pose(&mut kinematics, time + h));
         let rate = log_rotation(&before.rotation.tr_mul(&after.rotation)) / (2.0 * h);
         let speed = (after.translation - before.translation) / (2.0 * h);
         let acceleration = (after.translation - now.translation * 2.0 + before.translation) / (h * h);
         let gyro = rate + gyro_bias + noise.vector(config.gyro_noise);
-        let force = now.rotation.tr_mul(&(acceleration - GRAVITY)) + accelerometer_bias
+        let force = now.rotation.tr_mul(&(acceleration - GRAVITY))
+            + accelerometer_bias
             + noise.vector(config.accelerometer_noise);
         if k > 0 {
             angle += gyro * h;
@@ -128,7 +131,8 @@ fn run(seed: u64, seconds: f64, config: &EstimatorConfig, sole_w: impl Fn(f64) -
         let covariance = estimator.base_filter().covariance_of_motion();
         let kept = [0, 1, 3, 4, 5];
         let part = nalgebra::Matrix5::from_fn(|i, j| covariance[(kept[i], kept[j])]);
-        let e = nalgebra::Vector5::new(error.x, error.y, velocity_error.x, velocity_error.y, velocity_error.z);
+        let e =
+            nalgebra::Vector5::new(error.x, error.y, velocity_error.x, velocity_error.y, velocity_error.z);
         normalised = e.dot(&part.try_inverse().unwrap().mul_to(&e));
     }
     let found = estimator.estimate().gyro_bias;
