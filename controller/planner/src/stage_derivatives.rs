@@ -27,7 +27,7 @@ pub struct StageDerivatives {
     pub panel: Vec<f64>,
     /// Rows of every contact in its own unknowns ([`ContactSupport`]), `rows x support` each.
     pub contacts: Vec<Vec<f64>>,
-    /// Clearance rows at [`CLEARANCE_AT`] in `q(c)`: `4 x points x n`.
+    /// Clearance rows at [`crate::problem::CLEARANCE_AT`] in `q(c)`: `4 x points x n`.
     pub clearance: Vec<f64>,
     /// `∂x/∂q(c)` of the same points.
     pub(crate) clearance_x: Vec<f64>,
