@@ -16,7 +16,7 @@
 //! |---|---|---|
 //! | task | [`task`], [`terrain`], [`robot`], [`outline`] | what is asked, in words of the user |
 //! | problem | [`problem`], [`layout`], [`contact_law`] | unknowns, bounds, cost; formulation C |
-//! | stage | [`scalar`], [`node`], [`points`], [`stage`], [`stage_derivatives`] | Algorithms 1 to 3 on dual numbers; rows, Jacobian, Hessian |
+//! | stage | [`scalar`], [`node`], [`points`], [`stage`], [`stage_derivatives`], [`contact_derivatives`] | Algorithms 1 to 3 on dual numbers; rows, Jacobian, Hessian |
 //! | solver | [`barrier`], [`newton`], [`chain`], [`dense`], [`homotopy`] | augmented-Lagrangian barrier Newton on the stage chain; two passes |
 //! | plan | [`planner`], [`refine`], [`projection`], [`plan_file`] | guesses, more stages, DEL = 0, the file |
 //! | trust | [`check`], [`execution`] | residuals recomputed with the mechanics alone; every stage integrated finely |
@@ -36,6 +36,7 @@
 pub mod barrier;
 pub mod chain;
 pub mod check;
+pub mod contact_derivatives;
 pub mod contact_law;
 pub mod dense;
 pub mod error;

@@ -13,11 +13,12 @@
 
 use crate::barrier::Barrier;
 use crate::chain::Chain;
+use crate::contact_derivatives::ContactSupport;
 use crate::contact_law::Homotopy;
 use crate::error::PlanError;
 use crate::problem::Problem;
 use crate::stage::{Engine, StageValues};
-use crate::stage_derivatives::{ContactSupport, StageDerivatives};
+use crate::stage_derivatives::StageDerivatives;
 
 /// Largest scaled change of a position, an angle or a velocity in one step.
 const STEP_CAP: f64 = 0.5;

@@ -1,9 +1,10 @@
 //! Algebra with the rows of a stage: `J d`, `Jᵀ w`, `Jᵀ D J`.
 
+use crate::contact_derivatives::ContactSupport;
 use crate::dense::rank_update;
 use crate::problem::{CLEARANCE_AT, Problem};
 use crate::stage::polynomial;
-use crate::stage_derivatives::{ContactSupport, StageDerivatives};
+use crate::stage_derivatives::StageDerivatives;
 
 impl StageDerivatives {
     /// Adds the clearance rows' curvature and `D` terms: `Σ_p D g gᵀ + l h'' x xᵀ` at every fraction, spread to the nodes.
