@@ -11,8 +11,8 @@ use crate::cli::PartArguments;
 use crate::faults::FaultyController;
 use crate::output::say;
 use crate::part::{
-    PartFolder, Supervisor, ended, leave_part, leave_records, lost_after_s, message_run_id, prepare_machine,
-    run_id,
+    PartFolder, StandIn, Supervisor, ended, leave_part, leave_records, lost_after_s, message_run_id,
+    prepare_machine, run_id,
 };
 use crate::robot_controller::RobotController;
 use crate::run_folder::{CLOCK_READINGS, CONTROLLER_PART, CYCLE_INPUTS, CYCLE_RECORDS};
@@ -72,6 +72,7 @@ impl ControllerProcess<'_> {
         let _awake = prepare_machine(Role::Controller, scenario);
 
         let hash = setup.joint_set_hash();
+        let _stand_in = StandIn(supervisor, run);
         let mut membership =
             Membership::join(run, hash, Role::Controller, arguments.supervised, lost_after_s(scenario))
                 .map_err(Failure::fault)?;
@@ -91,7 +92,6 @@ impl ControllerProcess<'_> {
         let (ending, figures, records) =
             controller_loop.run(&mut controller, &mut membership).map_err(Failure::fault)?;
         drop(membership);
-        supervisor.stand_in(run);
         let folder = arguments.out.as_deref();
         leave_records(folder, CYCLE_RECORDS, &records)?;
         leave_part(folder, CONTROLLER_PART, &part(scenario, &figures))?;

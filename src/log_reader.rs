@@ -9,7 +9,7 @@ use std::io::{self, Read};
 use std::path::Path;
 
 use mcap::McapError;
-use mcap::records::{Metadata, Record};
+use mcap::records::{Metadata, Record, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
 use crate::input_file::open_plain;
@@ -60,6 +60,8 @@ pub struct LogReader<R> {
     input: R,
     events: Events,
     channels: BTreeMap<u16, Channel>,
+    /// Records of the chunk being read.
+    chunk: Vec<u8>,
     end: Option<End>,
 }
 
@@ -94,10 +96,10 @@ impl<R: Read> LogReader<R> {
     pub fn new(input: R) -> Self {
         let options = LinearReaderOptions::default()
             .with_skip_start_magic(true)
-            .with_prevalidate_chunk_crcs(true)
+            .with_emit_chunks(true)
             .with_record_length_limit(LARGEST_RECORD);
         let events = Events(LinearReader::new_with_options(options));
-        Self { input, events, channels: BTreeMap::new(), end: None }
+        Self { input, events, channels: BTreeMap::new(), chunk: Vec::new(), end: None }
     }
 
     /// Hands every item to `take` until it says `false` or the log ends; says how the log ends, or `None` when it was not read so far.
@@ -119,40 +121,119 @@ impl<R: Read> LogReader<R> {
                     let length = read(&mut self.input, self.events.0.insert(need)).map_err(Failure::fault)?;
                     self.events.0.notify_read(length);
                 }
-                Ok(LinearReadEvent::Record { opcode, data }) => match mcap::parse_record(opcode, data) {
-                    Err(error) => self.end = Some(End::Cut(in_words(&error))),
-                    Ok(Record::DataEnd(_)) => self.end = Some(End::Whole),
-                    Ok(record) => {
-                        let item = match note(record, &mut self.channels) {
-                            Ok(item) => item,
-                            Err(why) => {
-                                self.end = Some(End::Cut(why.to_owned()));
-                                break;
+                Ok(LinearReadEvent::Record { opcode: op::DATA_END, .. }) => self.end = Some(End::Whole),
+                Ok(LinearReadEvent::Record { opcode: op::CHUNK, data }) => {
+                    match open_chunk(data, &mut self.chunk) {
+                        Err(why) => self.end = Some(End::Cut(why)),
+                        Ok(()) => {
+                            let mut rest = self.chunk.as_slice();
+                            while !rest.is_empty() {
+                                let Some((opcode, data)) = next_record(&mut rest) else {
+                                    self.end = Some(End::Cut(
+                                        "a record in a chunk is longer than the chunk".to_owned(),
+                                    ));
+                                    break;
+                                };
+                                match hand_over(opcode, data, &mut self.channels, &mut take)? {
+                                    Handed::GoOn => {}
+                                    Handed::Enough => return Ok(None),
+                                    Handed::Bad(why) => {
+                                        self.end = Some(End::Cut(why));
+                                        break;
+                                    }
+                                }
                             }
-                        };
-                        let goes_on = match item {
-                            Noted::Nothing => true,
-                            Noted::About(about) => take(Item::About(about))?,
-                            Noted::Message { channel, time_ns, missing, at } => {
-                                let topic = self.channels.get(&channel).map_or("", |channel| &channel.topic);
-                                take(Item::Message {
-                                    topic,
-                                    time_ns,
-                                    missing,
-                                    data: data.get(at..).unwrap_or_default(),
-                                })?
-                            }
-                        };
-                        if !goes_on {
-                            return Ok(None);
                         }
                     }
-                },
+                }
+                Ok(LinearReadEvent::Record { opcode, data }) => {
+                    match hand_over(opcode, data, &mut self.channels, &mut take)? {
+                        Handed::GoOn => {}
+                        Handed::Enough => return Ok(None),
+                        Handed::Bad(why) => self.end = Some(End::Cut(why)),
+                    }
+                }
             }
         }
         Ok(self.end.clone())
     }
 }
+
+/// What came of a record.
+enum Handed {
+    GoOn,
+    /// Nobody wants more.
+    Enough,
+    /// It is not what it says.
+    Bad(String),
+}
+
+fn hand_over(
+    opcode: u8,
+    data: &[u8],
+    channels: &mut BTreeMap<u16, Channel>,
+    take: &mut impl FnMut(Item<'_>) -> Result<bool, Failure>,
+) -> Result<Handed, Failure> {
+    // Of other records nothing is needed, and the library (0.26) slices beyond the end of an attachment that is too short.
+    if ![op::METADATA, op::CHANNEL, op::MESSAGE].contains(&opcode) {
+        return Ok(Handed::GoOn);
+    }
+    let noted = mcap::parse_record(opcode, data).map_err(|error| in_words(&error));
+    let goes_on = match noted.and_then(|record| note(record, channels).map_err(str::to_owned)) {
+        Err(why) => return Ok(Handed::Bad(why)),
+        Ok(Noted::Nothing) => true,
+        Ok(Noted::About(about)) => take(Item::About(about))?,
+        Ok(Noted::Message { channel, time_ns, missing, at }) => {
+            let topic = channels.get(&channel).map_or("", |channel| &channel.topic);
+            take(Item::Message { topic, time_ns, missing, data: data.get(at..).unwrap_or_default() })?
+        }
+    };
+    Ok(if goes_on { Handed::GoOn } else { Handed::Enough })
+}
+
+/// Puts the records of a chunk into `records`, as far as they are believed: of the size and with the checksum it says.
+///
+/// Not by the library: 0.26 overflows on a record in a chunk that is longer than the chunk.
+fn open_chunk(data: &[u8], records: &mut Vec<u8>) -> Result<(), String> {
+    let (header, packed) = match mcap::parse_record(op::CHUNK, data) {
+        Ok(Record::Chunk { header, data }) => (header, data),
+        Ok(_) => return Err("a chunk is none".to_owned()),
+        Err(error) => return Err(in_words(&error)),
+    };
+    let size = usize::try_from(header.uncompressed_size).unwrap_or(usize::MAX);
+    if size > LARGEST_RECORD {
+        return Err(format!("a chunk says that it holds {} bytes", header.uncompressed_size));
+    }
+    records.clear();
+    let most = size as u64 + 1;
+    let unpacked = match header.compression.as_str() {
+        "" => packed.as_ref().take(most).read_to_end(records),
+        "lz4" => {
+            lz4::Decoder::new(packed.as_ref()).and_then(|decoder| decoder.take(most).read_to_end(records))
+        }
+        other => return Err(format!("a chunk is compressed by {other:?}, which is not read")),
+    };
+    unpacked.map_err(|error| format!("a chunk cannot be decompressed: {error}"))?;
+    if records.len() != size {
+        return Err("a chunk has another size than it says".to_owned());
+    }
+    if header.uncompressed_crc != 0 && crc32fast::hash(records) != header.uncompressed_crc {
+        return Err("the checksum of a chunk is another one".to_owned());
+    }
+    Ok(())
+}
+
+/// Takes the next record from the content of a chunk; `None`: it is longer than what is left.
+fn next_record<'a>(rest: &mut &'a [u8]) -> Option<(u8, &'a [u8])> {
+    let (head, behind) = rest.split_at_checked(RECORD_HEAD)?;
+    let length = u64::from_le_bytes(head[1..].try_into().ok()?);
+    let (data, behind) = behind.split_at_checked(usize::try_from(length).ok()?)?;
+    *rest = behind;
+    Some((head[0], data))
+}
+
+/// Bytes of a record before its content: what it is, and how long.
+const RECORD_HEAD: usize = 9;
 
 /// What a record means.
 enum Noted {
@@ -202,5 +283,60 @@ fn in_words(error: &McapError) -> String {
     match error {
         McapError::UnexpectedEof => "the file ends in the middle of it".to_owned(),
         other => other.to_string(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn record(code: u8, content: &[u8]) -> Vec<u8> {
+        [&[code][..], &(content.len() as u64).to_le_bytes(), content].concat()
+    }
+
+    /// A chunk whose content is `records`.
+    fn chunk(size: u64, records: &[u8]) -> Vec<u8> {
+        let numbers = [[0; 16].to_vec(), size.to_le_bytes().to_vec(), vec![0; 8]].concat();
+        record(
+            op::CHUNK,
+            &[numbers, (records.len() as u64).to_le_bytes().to_vec(), records.to_vec()].concat(),
+        )
+    }
+
+    fn end_of(content: &[u8]) -> Option<End> {
+        LogReader::new(content).each(|_| Ok(true)).unwrap()
+    }
+
+    #[test]
+    fn a_record_that_is_longer_than_its_chunk_is_where_the_log_is_cut() {
+        for length in [10, 1 << 32, u64::MAX / 2, u64::MAX - 8, u64::MAX] {
+            let inner = [&[op::MESSAGE][..], &length.to_le_bytes(), b"short"].concat();
+            let end = end_of(&chunk(inner.len() as u64, &inner));
+            assert!(
+                matches!(&end, Some(End::Cut(why)) if why.contains("longer than the chunk")),
+                "{length}: {end:?}"
+            );
+        }
+        for size in [0, 3, 1 << 40, u64::MAX] {
+            assert!(matches!(end_of(&chunk(size, b"1234")), Some(End::Cut(_))), "{size}");
+        }
+        for length in 0..60 {
+            let parts = [
+                op::ATTACHMENT,
+                op::SCHEMA,
+                op::STATISTICS,
+                op::CHUNK_INDEX,
+                op::MESSAGE,
+                op::CHANNEL,
+                op::METADATA,
+            ];
+            for code in parts {
+                end_of(&record(code, &vec![0; length]));
+                let inner = record(code, &vec![0; length]);
+                end_of(&chunk(inner.len() as u64, &inner));
+            }
+        }
+        let whole = [chunk(0, b""), record(op::DATA_END, &[0; 4])].concat();
+        assert_eq!(end_of(&whole), Some(End::Whole));
     }
 }

@@ -74,6 +74,17 @@ pub fn lost_after_s(scenario: &Scenario) -> Option<f64> {
     (scenario.clock == Clock::Realtime).then_some(scenario.process.hang_s)
 }
 
+/// Tidies up as [`Supervisor::stand_in`] when it is dropped, however the process came to its end. Make it before what belongs to the run, so
+/// that it is dropped after that.
+#[derive(Debug)]
+pub struct StandIn(pub Supervisor, pub RunId);
+
+impl Drop for StandIn {
+    fn drop(&mut self) {
+        self.0.stand_in(self.1);
+    }
+}
+
 /// Times a process looks whether it is the last one, and tidies up.
 const STAND_IN_ATTEMPTS: u32 = 10;
 const STAND_IN_PAUSE: Duration = Duration::from_millis(20);

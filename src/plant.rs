@@ -14,8 +14,8 @@ use crate::log::{Log, LogHead};
 use crate::log_viewer::LogViewer;
 use crate::output::say;
 use crate::part::{
-    PartFolder, Supervisor, ended, leave_part, leave_records, lost_after_s, message_run_id, prepare_machine,
-    run_id,
+    PartFolder, StandIn, Supervisor, ended, leave_part, leave_records, lost_after_s, message_run_id,
+    prepare_machine, run_id,
 };
 use crate::plant_process::{PlantLoop, PlantRun};
 use crate::run_folder::{PLANT_PART, STEP_RECORDS, effective};
@@ -44,6 +44,7 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
     let _awake = prepare_machine(Role::Plant, scenario);
 
     let hash = setup.joint_set_hash();
+    let _stand_in = StandIn(supervisor, run);
     let mut membership =
         Membership::join(run, hash, Role::Plant, arguments.supervised, lost_after_s(scenario))
             .map_err(Failure::fault)?;
@@ -75,7 +76,6 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
         ));
     }
     drop(membership);
-    supervisor.stand_in(run);
     let folder = arguments.out.as_deref();
     leave_records(folder, STEP_RECORDS, &records)?;
     leave_part(folder, PLANT_PART, &figures)?;

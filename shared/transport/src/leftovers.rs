@@ -94,7 +94,11 @@ pub fn remove_dead_runs(patience: Duration, stop: impl Fn() -> bool) -> Vec<RunI
             if seen_by_worker.load(Ordering::Relaxed) {
                 return;
             }
-            if !is_young(run) && remove_leftovers(run).is_ok() && tell.send(run).is_err() {
+            if !is_young(run)
+                && !is_elsewhere(run)
+                && remove_leftovers(run).is_ok()
+                && tell.send(run).is_err()
+            {
                 return;
             }
         }
@@ -153,6 +157,19 @@ fn bury_dead_processes(run: RunId) -> Result<(), LinkError> {
 fn process_id(node: &impl NodeView) -> u32 {
     let pid = node.details().as_ref().map(|details| details.process_id().value());
     pid.and_then(|pid| u32::try_from(pid).ok()).unwrap_or(0)
+}
+
+/// Whether a run has its folder in another place, for a login with another runtime folder, and lives: then a process of this user has its
+/// shared memory mapped.
+fn is_elsewhere(run: RunId) -> bool {
+    if run.root_path().is_ok_and(|root| root.symlink_metadata().is_ok()) {
+        return false; // its folder says who lives
+    }
+    let name = run.prefix();
+    let processes = files(Path::new("/proc")).into_iter();
+    processes
+        .filter_map(|process| fs::read(process.join("maps")).ok())
+        .any(|maps| maps.windows(name.len()).any(|window| window == name.as_bytes()))
 }
 
 /// Whether anything of the run was made or changed a moment ago.

@@ -202,6 +202,39 @@ fn dead_runs_are_removed_and_living_or_young_ones_are_not() {
     assert!(!living.files().is_empty() && !young.files().is_empty());
 }
 
+/// A login with another folder for its runs, of the same user, goes on while this one tidies up.
+#[test]
+#[allow(clippy::disallowed_methods, reason = "ages of files go by the wall clock")]
+fn a_run_of_another_login_that_lives_is_not_touched() {
+    let run = TestRun::new();
+    let elsewhere = std::env::temp_dir().join(format!("delmpc-elsewhere-{}", std::process::id()));
+    std::fs::create_dir_all(&elsewhere).unwrap();
+    std::fs::set_permissions(&elsewhere, std::os::unix::fs::PermissionsExt::from_mode(0o700)).unwrap();
+    let mut peer = Peer(
+        Process::new(std::env::current_exe().unwrap())
+            .args(["--exact", "two_processes::peer", "--ignored", "--nocapture"])
+            .env(RUN, run.0.to_string())
+            .env(ROLE, "publish states")
+            .env("XDG_RUNTIME_DIR", &elsewhere)
+            .stdout(Stdio::null())
+            .spawn()
+            .unwrap(),
+    );
+    wait_for("the peer's files", || (run.files().len() > 1).then_some(()));
+    sleep(Duration::from_millis(200));
+    let long_ago = SystemTime::now() - Duration::from_secs(60);
+    let files = run.files();
+    for file in &files {
+        std::fs::File::open(file).unwrap().set_modified(long_ago).unwrap();
+    }
+    assert!(!remove_dead_runs(Duration::from_secs(30), || false).contains(&run.0));
+    assert_eq!(run.files(), files);
+    peer.kill_9();
+    assert!(remove_dead_runs(Duration::from_secs(30), || false).contains(&run.0));
+    assert_eq!(run.files(), Vec::<PathBuf>::new());
+    std::fs::remove_dir_all(&elsewhere).unwrap();
+}
+
 #[test]
 fn a_process_killed_at_any_moment_of_its_start_does_not_block_the_next_one() {
     let run = TestRun::new();
