@@ -258,7 +258,8 @@ impl Servo {
         let sequence = command.header.sequence;
         let (valid_from_ns, newest) = (command.valid_from_ns, self.newest_sequence);
         // A command that waits for its time, whatever its number, does not keep out one that acts as soon.
-        let overtakes = self.pending.is_some_and(|at| valid_from_ns <= self.slots[at].command.valid_from_ns);
+        let overtakes =
+            self.pending.is_some_and(|at| valid_from_ns <= self.slots[at].command.valid_from_ns.max(now_ns));
         if sequence <= self.applied_sequence() || (sequence <= newest && !overtakes) {
             return Err(CommandRefused::OutOfOrder { sequence, newest });
         }
@@ -557,7 +558,9 @@ mod tests {
         let mut waiting = super::tests::servo(false);
         waiting.accept(&command(1, 5 * MS, 15 * MS, 99.0), 0).unwrap();
         waiting.accept(&command(1, 5 * MS, 15 * MS, 3.0), 4 * MS).unwrap();
-        assert_eq!(torque(&mut waiting, 5 * MS), [2.0, -2.0]);
+        // Or for a time just over, when nobody has asked for a torque since.
+        waiting.accept(&command(1, 6 * MS, 15 * MS, 3.0), 6 * MS).unwrap();
+        assert_eq!(torque(&mut waiting, 6 * MS), [2.0, -2.0]);
         // One that acts at once: the state says which one it was, and the next one is above it.
         servo.accept(&command(2_000_000, 0, 9_000 * MS, 99.0), 3 * MS).unwrap();
         servo.accept(&command(servo.applied_sequence() + 1, 0, 9 * MS, 3.0), 4 * MS).unwrap();
