@@ -11,7 +11,7 @@ use delmpc_plant::prelude::{
     HoldingGains, InertialUnitConfig, ModelErrors, MonitorConfig, PlantConfig, PlantModel, SensorConfig,
     Terrain, TerrainBox, TerrainGap, WatchdogConfig,
 };
-use delmpc_robots::RobotModel;
+use delmpc_robots::{Geometry, RobotModel, ShapeRole};
 use delmpc_scenario::{Clock, PushSettings, Scenario};
 use nalgebra::Vector3;
 
@@ -189,6 +189,8 @@ fn model(setup: &Setup) -> Result<PlantModel, Failure> {
         let point = contact.position - contact.radius * Vector3::z();
         Ok(ContactPoint { body, point, friction: scenario.plant.friction })
     });
+    let mut contacts = contacts.collect::<Result<Vec<_>, Failure>>()?;
+    contacts.extend(body_contacts(setup));
     let feet = robot.soles.iter().map(|sole| {
         let frame = robot.frame(&sole.frame).ok_or_else(|| on_no_body(&sole.frame))?;
         Ok(Foot {
@@ -200,10 +202,46 @@ fn model(setup: &Setup) -> Result<PlantModel, Failure> {
     });
     Ok(PlantModel {
         tree: robot.tree.clone(),
-        contacts: contacts.collect::<Result<_, Failure>>()?,
+        contacts,
         feet: feet.collect::<Result<_, Failure>>()?,
         joint_set_hash: setup.joint_set_hash(),
     })
+}
+
+/// Points of the links' shapes, so that a robot that fell lies on the ground: of links without contact points of their own, collision
+/// shapes where there are some, else those that are drawn.
+fn body_contacts(setup: &Setup) -> Vec<ContactPoint> {
+    let (robot, friction) = (&setup.robot, setup.scenario.plant.friction);
+    let has_contacts = |body: usize| robot.contacts.iter().any(|contact| contact.body == Some(body));
+    let has_collision = |link: &str| {
+        robot.shapes.iter().any(|shape| shape.link == link && shape.role == ShapeRole::Collision)
+    };
+    let mut points = Vec::new();
+    for shape in &robot.shapes {
+        let Some(body) = shape.attachment.body.filter(|body| !has_contacts(*body)) else { continue };
+        if shape.role == ShapeRole::Visual && has_collision(&shape.link) {
+            continue;
+        }
+        // Half of the box around the shape.
+        let half = match shape.geometry {
+            Geometry::Box { size } => 0.5 * size,
+            Geometry::Cylinder { radius, length } => Vector3::new(radius, radius, 0.5 * length),
+            Geometry::Capsule { radius, length } => Vector3::new(radius, radius, 0.5 * length + radius),
+            Geometry::Sphere { radius } => Vector3::repeat(radius),
+        };
+        let round = !matches!(shape.geometry, Geometry::Box { .. });
+        for corner in 0..8 {
+            let sign = |bit: usize| if corner >> bit & 1 == 0 { 1.0 } else { -1.0 };
+            let mut at = Vector3::new(sign(0), sign(1), sign(2)).component_mul(&half);
+            if round {
+                // On the cylinder, not on the corners of its box.
+                at.x *= std::f64::consts::FRAC_1_SQRT_2;
+                at.y *= std::f64::consts::FRAC_1_SQRT_2;
+            }
+            points.push(ContactPoint { body, point: shape.attachment.pose.transform_point(&at), friction });
+        }
+    }
+    points
 }
 
 fn config(setup: &Setup, holding: &Holding, start: &Start) -> Result<PlantConfig, Failure> {

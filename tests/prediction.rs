@@ -37,7 +37,12 @@ struct Prediction {
 /// within 2 % of the largest. The stage is the first one, which is as long as a command holds; the servo works on it meanwhile.
 #[test]
 fn the_plan_says_where_the_plant_will_be() {
-    let setup = setup(&["sensors.noise_scale=0", "clock=lockstep", "reach.start_s=0.2"]);
+    let setup = setup(&[
+        "sensors.noise_scale=0",
+        "sensors.motion_capture=true",
+        "clock=lockstep",
+        "reach.start_s=0.2",
+    ]);
     let hash = setup.joint_set_hash();
     let joints = setup.robot.joint_names.len();
     let mut plant = SimulatedRobot::new(&setup).unwrap();

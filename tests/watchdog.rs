@@ -86,5 +86,5 @@ fn no_rung_shakes_atlas_standing_or_sinking() {
 
 #[test]
 fn no_rung_shakes_the_lamp() {
-    assert_calm("lamp", &silence("configs/examples/lamp/lamp.toml", &[]));
+    assert_calm("lamp", &silence("configs/examples/lamp/reach.toml", &[]));
 }

@@ -21,7 +21,7 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use delmpc_messages::{Command, ConstraintKind, MAX_JOINTS, MAX_SEGMENTS};
-use faer::Mat;
+use faer::{Mat, MatRef};
 use nalgebra::Vector3;
 
 use crate::horizon_problem::HorizonProblem;
@@ -95,6 +95,11 @@ impl Law {
     /// The segments in use, to write.
     pub fn segments_mut(&mut self) -> &mut [LawSegment] {
         &mut self.segments[..self.used]
+    }
+
+    /// The segments in use, to write, and the gain.
+    pub fn segments_and_gain(&mut self) -> (&mut [LawSegment], MatRef<'_, f64>) {
+        (&mut self.segments[..self.used], self.gain.as_ref())
     }
 
     /// Leaves the first segment only, and hands it out.

@@ -16,6 +16,7 @@ use super::{Controller, to_ns};
 use crate::config::ControllerKind;
 use crate::estimator::Estimate;
 use crate::feedback_law::{LawSegment, bound_by_pressure_point, write_law};
+use crate::kernels::gemv;
 
 /// Part of effort over velocity limit that damps a joint on the last rungs.
 const DAMPING_FRACTION: f64 = 0.1;
@@ -169,6 +170,25 @@ impl Controller {
             self.keep_last_bounds(true);
         }
         self.law.segments_mut().iter_mut().for_each(LawSegment::clamp);
+        self.allow_for_means();
+    }
+
+    /// The servo's velocities are means over its last samples, so in a motion they are behind the reference by half of their time: without
+    /// its part of the gain in the torque the law would brake or push for that.
+    fn allow_for_means(&mut self) {
+        let n = self.model.tree.dof();
+        let samples = self.command.rate_samples.saturating_sub(1);
+        let lag_s = 0.5 * f64::from(samples) * self.config.servo_period_s;
+        let Self { law, scratch, .. } = self;
+        let (segments, gain) = law.segments_and_gain();
+        let missing = &mut scratch[..2 * n];
+        for segment in segments {
+            missing[..n].fill(0.0);
+            for (missing, acceleration) in missing[n..].iter_mut().zip(&segment.acceleration) {
+                *missing = lag_s * acceleration;
+            }
+            gemv(&mut segment.torque, faer::Accum::Add, gain, missing, 1.0);
+        }
     }
 
     /// Narrows the bounds of all segments to what the pressure point allows in the first one, in the plan's stage `stage`: what the
