@@ -11,11 +11,13 @@ use delmpc_estimation::prelude::{
     BaseEstimate, EstimationError, Estimator as BaseEstimator, FootEstimate, FootMeasurement, Inertial,
     Measurement,
 };
+use delmpc_mechanics::errors::ModelError;
 use delmpc_mechanics::spatial::{RigidTransform, Twist, Wrench};
-use delmpc_messages::{MAX_FEET, PlantState, foot, sensor};
+use delmpc_messages::{Command, MAX_FEET, PlantState, foot, sensor};
 use nalgebra::{Quaternion, UnitQuaternion, Vector2, Vector3};
 
 use crate::errors::ControlError;
+use crate::feedback_law::Law;
 use crate::level_stance::LevelStance;
 use crate::model::ControllerModel;
 
@@ -194,9 +196,32 @@ impl Estimator {
         self.base.as_ref().map_or(&[], BaseEstimator::feet)
     }
 
-    /// The levelled stance foot, when the last measurement was levelled, and the gyroscope's sum, when there is one.
-    pub(crate) fn levelled(&self) -> Option<(&LevelStance, Option<Vector3<f64>>)> {
-        self.level.as_ref().filter(|_| self.levelled).map(|level| (level, self.imu_angle))
+    /// Tells the law, which has been written in terms of the levelled ankle, in terms of what the servo feels: by the gyroscope, or by
+    /// encoders as they are while the foot moves on as it does. `since_s`: from the measurement to the begin of the command.
+    ///
+    /// # Errors
+    /// [`ModelError`] when the law does not fit the model.
+    pub(crate) fn tell_law(
+        &mut self,
+        model: &ControllerModel,
+        law: &Law,
+        since_s: f64,
+        command: &mut Command,
+    ) -> Result<(), ModelError> {
+        let joints = &model.message_joint;
+        let Some(level) = self.level.as_mut().filter(|_| self.levelled) else { return Ok(()) };
+        let (Some(angle), Some(sensing)) = (self.imu_angle, &model.sensing) else {
+            level.write_encoders(joints, command);
+            return Ok(());
+        };
+        let mounting = &sensing.estimator.imu_mounting.rotation;
+        let bias = self.base.as_ref().map(|base| base.estimate().gyro_bias).unwrap_or_default();
+        level.write(&model.tree, law, joints, (mounting, &angle, &bias), since_s, command)
+    }
+
+    /// The levelled stance foot, when the law is told by the gyroscope.
+    pub(crate) fn told_by_gyroscope(&self) -> Option<&LevelStance> {
+        self.level.as_ref().filter(|_| self.levelled && self.imu_angle.is_some())
     }
 }
 

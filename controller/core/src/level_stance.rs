@@ -29,6 +29,7 @@ use alloc::vec::Vec;
 
 use delmpc_mechanics::errors::ModelError;
 use delmpc_mechanics::kinematics::{Configuration, Kinematics};
+use delmpc_mechanics::spatial::log_rotation;
 use delmpc_mechanics::tree::{JointKind, KinematicTree};
 use delmpc_messages::{Command, MAX_JOINTS};
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
@@ -41,6 +42,9 @@ const LEAST_SINE: f64 = 0.5;
 const ITERATIONS: usize = 4;
 /// Lean at which they end, rad.
 const CONVERGED: f64 = 1e-12;
+
+/// Time over which the turning of the reference is differenced, s.
+const MOMENT_S: f64 = 1e-3;
 
 /// Ankle and chain of one foot, with the axes of the last measurement.
 #[derive(Clone, Debug)]
@@ -62,6 +66,8 @@ pub(crate) struct LevelStance {
     lean: Vector2<f64>,
     /// The same of their rates.
     lean_rate: Vector2<f64>,
+    /// A state a moment later.
+    later: Vec<f64>,
 }
 
 impl LevelStance {
@@ -95,6 +101,7 @@ impl LevelStance {
             sole_rotation: Matrix3::identity(),
             lean: Vector2::zeros(),
             lean_rate: Vector2::zeros(),
+            later: vec![0.0; 2 * tree.dof()],
             kinematics,
         }))
     }
@@ -191,28 +198,37 @@ impl LevelStance {
 
     /// Tells the law in terms of gyroscope and other joints: what [`crate::feedback_law::write_law`] has written in terms of the levelled
     /// ankle. `angle` is the gyroscope's sum at the measurement, in the axes of the inertial unit, which `mounting` turns into the
-    /// link's; `x` the levelled state measured then, `since_s` the time from the measurement to the begin of the command.
+    /// link's; `since_s` the time from the measurement to the begin of the command.
+    ///
+    /// # Errors
+    /// [`ModelError::Length`] when the law does not fit the tree.
     pub fn write(
-        &self,
+        &mut self,
+        tree: &KinematicTree,
         law: &Law,
         message_joint: &[usize],
         (mounting, angle, bias): (&Matrix3<f64>, &Vector3<f64>, &Vector3<f64>),
-        (x, since_s): (&[f64], f64),
+        since_s: f64,
         command: &mut Command,
-    ) {
+    ) -> Result<(), ModelError> {
         let n = message_joint.len();
         let to_w = self.rotation * mounting;
         for (segment, out) in law.segments().iter().zip(&mut command.segments) {
-            let (mut way, mut rate, mut acceleration) =
-                (Vector3::zeros(), Vector3::zeros(), Vector3::zeros());
-            for &joint in &self.chain {
-                way += self.axes[joint] * (segment.reference[joint] - x[joint]);
-                rate += self.axes[joint] * segment.reference[n + joint];
-                acceleration += self.axes[joint] * segment.acceleration[joint];
+            // The link where the reference has it, and how it turns there, now and a moment later.
+            let (q, rates) = segment.reference.split_at(n);
+            let (reference, rate) = self.turning(tree, q, rates)?;
+            for j in 0..n {
+                self.later[j] = q[j] + MOMENT_S * (rates[j] + 0.5 * MOMENT_S * segment.acceleration[j]);
+                self.later[n + j] = rates[j] + MOMENT_S * segment.acceleration[j];
             }
-            out.imu_angle_ref = (angle + to_w.tr_mul(&way) + bias * (since_s + segment.begin_s)).into();
-            out.imu_rate_ref = to_w.tr_mul(&rate).into();
-            out.imu_acceleration_ref = to_w.tr_mul(&acceleration).into();
+            let later = core::mem::take(&mut self.later);
+            let turned = self.turning(tree, &later[..n], &later[n..]);
+            self.later = later;
+            let acceleration = (turned?.1 - rate) / MOMENT_S;
+            let way = log_rotation(&self.rotation.tr_mul(&reference));
+            out.imu_angle_ref = (angle + mounting.tr_mul(&way) + bias * (since_s + segment.begin_s)).into();
+            out.imu_rate_ref = mounting.tr_mul(&rate).into();
+            out.imu_acceleration_ref = mounting.tr_mul(&acceleration).into();
         }
         command.imu_rate_bias = (*bias).into();
         for (i, &row) in message_joint.iter().enumerate() {
@@ -233,5 +249,20 @@ impl LevelStance {
                 command.imu_gain[row][first..first + 3].copy_from_slice(on_imu.as_slice());
             }
         }
+        Ok(())
+    }
+
+    /// Axes of the link in {0} at `q`, and its angular velocity in its own axes.
+    fn turning(
+        &mut self,
+        tree: &KinematicTree,
+        q: &[f64],
+        rates: &[f64],
+    ) -> Result<(Matrix3<f64>, Vector3<f64>), ModelError> {
+        self.kinematics.update_positions(tree, &Configuration::fixed(q))?;
+        let twists = self.kinematics.joint_twists_w();
+        let rate: Vector3<f64> = self.chain.iter().map(|joint| twists[*joint].angular * rates[*joint]).sum();
+        let rotation = self.kinematics.link_poses_w()[self.body].rotation;
+        Ok((rotation, rotation.tr_mul(&rate)))
     }
 }

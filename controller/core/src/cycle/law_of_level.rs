@@ -10,7 +10,7 @@
 
 use delmpc_mechanics::inverse_dynamics::gravity_force_into;
 use delmpc_messages::{FallbackLevel, LARGEST_EFFORT, PlantState, StateEstimate};
-use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
+use nalgebra::{Rotation3, UnitQuaternion};
 
 use super::{Controller, to_ns};
 use crate::config::ControllerKind;
@@ -86,22 +86,14 @@ impl Controller {
         let joints = &self.model.message_joint;
         write_law(&self.law, joints, &mut self.command);
         self.command.imu_gain = Default::default();
-        let n = self.model.tree.dof();
-        let Estimate { q, q_dot, ground_lean, .. } = self.estimator.estimate();
-        let levelled = self.estimator.levelled();
-        if let Some((level, Some(angle))) = levelled {
-            let since_s = start_ns.saturating_sub(self.command.state_time_ns) as f64 * 1e-9;
-            self.scratch[..n].copy_from_slice(q);
-            self.scratch[n..].copy_from_slice(q_dot);
-            let mounting = self.model.sensing.as_ref().map(|sensing| sensing.estimator.imu_mounting.rotation);
-            let bias = self.estimator.base().map(|base| base.gyro_bias).unwrap_or_default();
-            let unit = (&mounting.unwrap_or_else(Matrix3::identity), &angle, &bias);
-            level.write(&self.law, joints, unit, (&self.scratch, since_s), &mut self.command);
-        } else if let Some((level, None)) = levelled {
-            level.write_encoders(joints, &mut self.command);
+        let since_s = start_ns.saturating_sub(self.command.state_time_ns) as f64 * 1e-9;
+        if self.estimator.tell_law(&self.model, &self.law, since_s, &mut self.command).is_err() {
+            // Never of a law of this model; what has been written holds for a foot that rests.
+            return;
         }
         if let Some(leg) = &self.unloaded_leg {
-            let level = levelled.filter(|(_, angle)| angle.is_some()).map(|(level, _)| level);
+            let Estimate { q, ground_lean, .. } = self.estimator.estimate();
+            let level = self.estimator.told_by_gyroscope();
             leg.write(level, q, (*ground_lean).into(), joints, &mut self.command);
         }
     }
