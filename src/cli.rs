@@ -193,7 +193,7 @@ pub enum Command {
     Report(ReportArguments),
     /// Plan a motion through contact, nobody names who touches when; or check a plan file
     ///
-    /// The scenario says robot, ground, way and time in its section [plan]. Left behind is a plan file: times, states, torques,
+    /// The scenario says robot, ground, way and time in its section `[plan]`. Left behind is a plan file: times, states, torques,
     /// impulses and contact sets at every stage.
     #[command(after_long_help = PLAN_EXAMPLES)]
     Plan(PlanArguments),

@@ -285,7 +285,6 @@ fn config(setup: &Setup, holding: &Holding, start: &Start) -> Result<PlantConfig
         },
         monitor: MonitorConfig { stance_foot: stance.unwrap_or(0), ..MonitorConfig::default() },
         seed: scenario.seed,
-        ..PlantConfig::default()
     })
 }
 

@@ -1,7 +1,7 @@
 //! From a measurement to the state of the foot-rooted model.
 //!
 //! The joints of the foot-rooted tree are the measured joints in another order (see `delmpc_mechanics::reroot`). Base and feet come from
-//! `delmpc_estimation`; what they say of how the robot leans replaces what the stance ankle's encoders say ([`crate::level_stance`]).
+//! `delmpc_estimation`; what they say of how the robot leans replaces what the stance ankle's encoders say (`level_stance.rs`).
 //! A robot without an inertial unit, or one bolted to the ground, has its encoders only, and its stance foot is taken to be level.
 
 use alloc::vec;

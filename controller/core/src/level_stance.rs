@@ -154,7 +154,8 @@ impl LevelStance {
         }
         self.take_axes();
         let lean = (self.rotation * up).xy();
-        if !converged && !(lean.norm() < 1e-6) {
+        let level = lean.norm() < 1e-6;
+        if !converged && !level {
             (q[first], q[second]) = (encoders.x, encoders.y);
             self.kinematics.update_positions(tree, &Configuration::fixed(q))?;
             self.take_axes();

@@ -254,13 +254,14 @@ impl BaseFilter {
         Row { blocks, residual: -(self.rotation * rate)[axis], variance, gate: GATE }
     }
 
-    /// Row of gravity's direction felt at rest: `axis` 0 or 1 of `R a / |a|`.
-    pub(crate) fn level_row(&self, axis: usize, up: &Vector3<f64>, variance: f64) -> Row {
-        let up_w = self.rotation * up;
-        // True R up = e_z: 0 = up_w + θ × up_w along x and y.
+    /// Row of gravity's direction felt at rest: `axis` 0 or 1 of `R (f - b_a) / g`.
+    pub(crate) fn level_row(&self, axis: usize, specific_force: &Vector3<f64>, variance: f64) -> Row {
+        let gravity = self.gravity.norm();
+        let up_w = self.rotation * (specific_force - self.accelerometer_bias) / gravity;
+        // True: e_z. 0 = up_w + θ × up_w - R δb_a / g along x and y.
         let blocks = [
             (THETA, -skew(&up_w).row(axis).transpose()),
-            (THETA, Vector3::zeros()),
+            (ACCELEROMETER_BIAS, -self.rotation.row(axis).transpose() / gravity),
             (THETA, Vector3::zeros()),
         ];
         Row { blocks, residual: -up_w[axis], variance, gate: f64::INFINITY }
@@ -289,7 +290,8 @@ impl BaseFilter {
         let predicted = dot(&self.column);
         let innovation = row.residual - dot(&self.correction);
         let mut variance = predicted + row.variance;
-        if !(variance > 0.0) || !innovation.is_finite() {
+        let usable = variance > 0.0 && innovation.is_finite();
+        if !usable {
             return f64::INFINITY;
         }
         let deviations = innovation.abs() / libm::sqrt(variance);

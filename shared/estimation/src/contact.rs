@@ -97,6 +97,8 @@ impl ContactSwitch {
 const SETTLING: f64 = 0.05;
 /// Time in which it is forgotten, and in which the variance of a shaking foot is measured, s.
 const SHAKE_S: f64 = 0.1;
+/// By chance the variance over that time is larger than the expected one by this factor, and nothing shakes.
+const CHANCE: f64 = 2.0;
 /// Time over which the mean is taken about which a foot shakes, s.
 const MEAN_S: f64 = 0.05;
 
@@ -104,7 +106,7 @@ const MEAN_S: f64 = 0.05;
 /// not the foot's but the base's, and is left to the filter.
 ///
 /// ```text
-/// m += (ν - m) t/T_m        s += ((ν - m)² - s) t/T_s        noise of the row gains max(0, s - its own variance)
+/// m += (ν - m) t/T_m        s += ((ν - m)² - s) t/T_s        noise of the row gains max(0, s - 2 its own variance)
 /// ```
 ///
 /// Source: R. Mehra, *On the identification of variances and adaptive Kalman filtering*, IEEE TAC 15, 1970 (innovation variance).
@@ -132,7 +134,7 @@ impl Shake {
         let about = innovation - *mean;
         *mean += about * (duration / MEAN_S).min(1.0);
         *square += (about * about - *square) * (duration / SHAKE_S).min(1.0);
-        (*square - expected).max(0.0)
+        (*square - CHANCE * expected).max(0.0)
     }
 }
 

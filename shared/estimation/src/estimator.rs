@@ -21,8 +21,8 @@ use crate::model::{EstimatorConfig, EstimatorModel, Inertial, Measurement};
 /// Longest time between two measurements that is bridged, s.
 const LONGEST_GAP_S: f64 = 0.5;
 /// Deviation of the felt gravity's direction at the start, rad, and per part by which its size is not that of gravity.
-const FELT_TILT: f64 = 5e-3;
-const FELT_TILT_PER_SIZE: f64 = 2.0;
+const FELT_TILT: f64 = 5e-4;
+const FELT_TILT_PER_SIZE: f64 = 1.0;
 /// Part by which the felt size may differ for it to say anything.
 const FELT_SIZE: f64 = 0.1;
 
@@ -207,13 +207,13 @@ impl Estimator {
         let (size, gravity) = (inertial.specific_force.norm(), self.model.tree.gravity_w().norm());
         let off = (size / gravity - 1.0).abs();
         if off < FELT_SIZE {
-            let bias = self.config.accelerometer_bias / gravity;
-            let deviation = FELT_TILT + FELT_TILT_PER_SIZE * off + bias;
-            let up = inertial.specific_force / size;
-            // Twice: the first one may be far.
+            let noise = self.config.accelerometer_noise / gravity;
+            let deviation = FELT_TILT + FELT_TILT_PER_SIZE * off;
+            // Twice: the first one may be far. Both are the same sample.
+            let variance = 2.0 * (noise * noise + deviation * deviation);
             for _ in 0..2 {
                 for axis in 0..2 {
-                    let row = self.filter.level_row(axis, &up, 2.0 * deviation * deviation);
+                    let row = self.filter.level_row(axis, &inertial.specific_force, variance);
                     self.filter.take(&row);
                 }
                 self.filter.correct();
