@@ -251,6 +251,7 @@ fn processes_with_different_joints_do_not_meet() {
     assert_eq!(ended.status, Some(3), "{}", ended.errors);
     assert!(ended.errors.contains("the peer has joint set"), "{}", ended.errors);
     support::signal(plant.pid(), Signal::TERM);
-    assert_eq!(plant.wait().status, Some(130));
+    let ended = plant.wait();
+    assert_eq!(ended.status, Some(130), "{}", ended.errors);
     assert_eq!(shared_memory_of(&run_id), Vec::<String>::new());
 }

@@ -106,7 +106,7 @@ impl Membership {
         let presence = Presence::new(&node, joint_set_hash, role)?;
         let supervisor = if supervised { Some(Peer::new(&node, Role::Supervisor)?) } else { None };
         let other = if role == Role::Plant { Role::Controller } else { Role::Plant };
-        let peer = Peer::new(&node, other)?;
+        let peer = Peer::new(&node, other)?.with_joint_set(joint_set_hash);
         let parent = supervised.then(getppid).flatten();
         Ok(Self { node, presence, supervisor, peer, stop, parent, hang_s })
     }

@@ -71,6 +71,8 @@ const LONGEST_LOOK_NS: u64 = 200_000_000;
 #[derive(Debug)]
 pub struct Peer {
     subscriber: SharedSubscriber<Heartbeat>,
+    /// Only a process with these joints is meant.
+    joint_set_hash: Option<u64>,
     latest: Option<Heartbeat>,
     looked_ns: u64,
     silent_ns: u64,
@@ -83,7 +85,14 @@ impl Peer {
     /// When the channel cannot be opened.
     pub fn new(node: &RunNode, role: Role) -> Result<Self, LinkError> {
         let subscriber = node.subscriber(Channel::Heartbeat(role))?;
-        Ok(Self { subscriber, latest: None, looked_ns: monotonic_ns(), silent_ns: 0 })
+        Ok(Self { subscriber, joint_set_hash: None, latest: None, looked_ns: monotonic_ns(), silent_ns: 0 })
+    }
+
+    /// Follows it only with these joints: another one is refused by both, and neither its coming nor its going means anything.
+    #[must_use]
+    pub fn with_joint_set(mut self, joint_set_hash: u64) -> Self {
+        self.joint_set_hash = Some(joint_set_hash);
+        self
     }
 
     /// Takes in what is new. A sign of life that cannot be understood counts as none.
@@ -97,7 +106,8 @@ impl Peer {
         if let Some(heartbeat) = self.subscriber.receive_latest()? {
             let sequence = heartbeat.header.sequence;
             let news = self.latest.is_none_or(|latest| latest.header.sequence != sequence);
-            if news && heartbeat.validate(heartbeat.header.joint_set_hash).is_ok() {
+            let expected = self.joint_set_hash.unwrap_or(heartbeat.header.joint_set_hash);
+            if news && heartbeat.validate(expected).is_ok() {
                 self.latest = Some(*heartbeat);
                 self.silent_ns = 0;
             }
