@@ -184,6 +184,9 @@ impl Plant {
     /// Refuses a watchdog that would shake the robot: every rung's law, sampled at the plant's rate, on the robot with a free base.
     fn check_watchdog(&self, config: &WatchdogConfig) -> Result<(), PlantError> {
         let n = self.tree.joint_count();
+        if n == 0 {
+            return Ok(());
+        }
         let diagonal = |values: &[f64]| {
             let value = |i: usize| values.get(i).copied().unwrap_or(0.0);
             DMatrix::from_fn(n, n, |row, column| if row == column { value(row) } else { 0.0 })
