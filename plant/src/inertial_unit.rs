@@ -22,7 +22,7 @@ use delmpc_mechanics::spatial::{RigidTransform, exp_rotation, log_rotation};
 use nalgebra::{Rotation3, Unit, UnitQuaternion, Vector3};
 
 use crate::error::{PlantError, require};
-use crate::random::Random;
+use crate::random::{Random, quantise};
 
 /// Where the unit is, and how bad.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -118,8 +118,8 @@ impl InertialUnit {
     /// A unit whose noises and biases are those of `config` times `noise_scale`.
     pub fn new(config: &InertialUnitConfig, noise_scale: f64, seed: u64) -> Self {
         let mut random = Random::new(seed, 3);
-        let gyro_bias = vector(&mut random, noise_scale * config.gyro_bias);
-        let accelerometer_bias = vector(&mut random, noise_scale * config.accelerometer_bias);
+        let gyro_bias = random.vector(noise_scale * config.gyro_bias);
+        let accelerometer_bias = random.vector(noise_scale * config.accelerometer_bias);
         let (last, reading) = (None, InertialReading::default());
         Self { config: *config, noise_scale, random, gyro_bias, accelerometer_bias, last, reading }
     }
@@ -158,11 +158,11 @@ impl InertialUnit {
         self.last = Some((Unit::new_normalize(rotation.into_inner()), *velocity_w));
         let c = &self.config;
         let scale = self.noise_scale;
-        let gyro_error = self.gyro_bias + vector(&mut self.random, scale * c.gyro_noise);
+        let gyro_error = self.gyro_bias + self.random.vector(scale * c.gyro_noise);
         let gyro = pose_w.rotation.tr_mul(angular_velocity_w) + gyro_error;
         let force = mean_rotation.tr_mul(&(acceleration - gravity_w))
             + self.accelerometer_bias
-            + vector(&mut self.random, scale * c.accelerometer_noise);
+            + self.random.vector(scale * c.accelerometer_noise);
         let out = &mut self.reading;
         out.angular_velocity = gyro.map(|x| quantise(x, c.gyro_resolution));
         out.specific_force = force.map(|x| quantise(x, c.accelerometer_resolution));
@@ -171,18 +171,10 @@ impl InertialUnit {
             out.velocity += out.specific_force * time_step;
         }
         let root = time_step.sqrt() * scale;
-        self.gyro_bias += vector(&mut self.random, root * c.gyro_bias_walk);
-        self.accelerometer_bias += vector(&mut self.random, root * c.accelerometer_bias_walk);
+        self.gyro_bias += self.random.vector(root * c.gyro_bias_walk);
+        self.accelerometer_bias += self.random.vector(root * c.accelerometer_bias_walk);
         self.reading
     }
-}
-
-fn vector(random: &mut Random, deviation: f64) -> Vector3<f64> {
-    Vector3::from_fn(|_, _| deviation * random.normal())
-}
-
-fn quantise(value: f64, resolution: f64) -> f64 {
-    if resolution > 0.0 { (value / resolution).round() * resolution } else { value }
 }
 
 #[cfg(test)]

@@ -3,6 +3,8 @@
 //! Source: D. Blackman, S. Vigna, *Scrambled linear pseudorandom number generators*, 2021 (xoshiro256++, seeded by SplitMix64);
 //! normal deviates by G. Marsaglia's polar method.
 
+use nalgebra::Vector3;
+
 /// Generator of one stream.
 #[derive(Clone, Debug)]
 pub struct Random {
@@ -48,6 +50,11 @@ impl Random {
         low + (high - low) * self.uniform()
     }
 
+    /// Three of them, with this standard deviation.
+    pub fn vector(&mut self, deviation: f64) -> Vector3<f64> {
+        Vector3::from_fn(|_, _| deviation * self.normal())
+    }
+
     /// Normal with mean 0 and standard deviation 1.
     pub fn normal(&mut self) -> f64 {
         if let Some(value) = self.spare.take() {
@@ -63,6 +70,11 @@ impl Random {
             }
         }
     }
+}
+
+/// The nearest whole step of a sensor; a resolution of 0 leaves the value as it is.
+pub(crate) fn quantise(value: f64, resolution: f64) -> f64 {
+    if resolution > 0.0 { (value / resolution).round() * resolution } else { value }
 }
 
 #[cfg(test)]

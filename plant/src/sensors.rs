@@ -9,12 +9,11 @@
 //! motion capture, where there is one; else they are for the log only.
 
 use delmpc_mechanics::spatial::{RigidTransform, Twist, Wrench, exp_rotation};
-use nalgebra::Vector3;
 
 use crate::delay::{DelayLine, delay_steps};
 use crate::error::{PlantError, require};
 use crate::inertial_unit::{InertialReading, InertialUnitConfig};
-use crate::random::Random;
+use crate::random::{Random, quantise};
 
 /// Standard deviations, resolutions and delay; all 0 for perfect sensors.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -226,14 +225,14 @@ impl Sensors {
         }
         let random = &mut self.random;
         let pose = &mut self.fresh.base_pose_w;
-        pose.translation += vector(random, scale * c.base_position_noise);
-        pose.rotation *= exp_rotation(&vector(random, scale * c.base_orientation_noise));
+        pose.translation += random.vector(scale * c.base_position_noise);
+        pose.rotation *= exp_rotation(&random.vector(scale * c.base_orientation_noise));
         let twist = &mut self.fresh.base_twist_b;
-        twist.angular += vector(random, scale * c.base_angular_velocity_noise);
-        twist.linear += vector(random, scale * c.base_linear_velocity_noise);
+        twist.angular += random.vector(scale * c.base_angular_velocity_noise);
+        twist.linear += random.vector(scale * c.base_linear_velocity_noise);
         for wrench in &mut self.fresh.foot_wrench {
-            wrench.force += vector(random, scale * c.force_noise);
-            wrench.torque += vector(random, scale * c.torque_noise);
+            wrench.force += random.vector(scale * c.force_noise);
+            wrench.torque += random.vector(scale * c.torque_noise);
         }
         self.line.newest().copy_from(&self.fresh);
         self.line.advance();
@@ -258,14 +257,6 @@ impl Sensors {
     pub fn told(&self) -> &Readings {
         self.line.oldest()
     }
-}
-
-fn vector(random: &mut Random, deviation: f64) -> Vector3<f64> {
-    Vector3::from_fn(|_, _| deviation * random.normal())
-}
-
-fn quantise(value: f64, resolution: f64) -> f64 {
-    if resolution > 0.0 { (value / resolution).round() * resolution } else { value }
 }
 
 #[cfg(test)]
