@@ -47,11 +47,14 @@ use nalgebra::{Matrix3, Vector3};
 
 use crate::contact_law::{ContactLaw, ContactProblem, LawPath, LawReport, Regularisation};
 use crate::dense::largest;
-use crate::error::{PlantError, require, require_length};
+use crate::error::{PlantError, require_length};
 use crate::step_newton::StepNewton;
 use crate::terrain::Terrain;
 
+mod check;
 mod report;
+
+use check::{check, check_friction};
 
 pub use report::{ContactOptions, ContactPoint, ContactReport, ContactResult, GroundGive};
 
@@ -571,51 +574,4 @@ impl ContactStep {
             result.touching = result.normal_impulse > load_limit;
         }
     }
-}
-
-fn check(
-    tree: &KinematicTree,
-    contacts: &[ContactPoint],
-    options: &ContactOptions,
-) -> Result<(), PlantError> {
-    for contact in contacts {
-        if contact.body >= tree.body_count() {
-            let (got, expected) = (contact.body, tree.body_count());
-            return Err(PlantError::Shape { quantity: "body of a contact point", got, expected });
-        }
-        check_friction(contact.friction)?;
-        for value in contact.point.iter() {
-            require(value.is_finite(), "a contact point", *value, "finite")?;
-        }
-    }
-    let Regularisation { strength, forgetting } = options.regularisation;
-    let share = |x: f64| (0.0..=1.0).contains(&x);
-    require(
-        options.correction > 0.0 && share(options.correction),
-        "correction",
-        options.correction,
-        "in (0, 1]",
-    )?;
-    require(share(strength), "regularisation", strength, "in [0, 1]")?;
-    require(share(forgetting), "forgetting", forgetting, "in [0, 1]")?;
-    require(options.tolerance > 0.0 && options.tolerance < 1.0, "tolerance", options.tolerance, "in (0, 1)")?;
-    let GroundGive { stiffness, damping } = options.ground;
-    require(stiffness > 0.0, "stiffness of the ground", stiffness, "positive (infinite for rigid)")?;
-    require(
-        damping.is_finite() && damping >= 0.0,
-        "damping of the ground",
-        damping,
-        "finite and not negative",
-    )?;
-    require(options.max_rounds > 0, "rounds", options.max_rounds as f64, "at least 1")?;
-    require(options.max_candidates <= 64, "candidates", options.max_candidates as f64, "at most 64")
-}
-
-fn check_friction(friction: f64) -> Result<(), PlantError> {
-    require(
-        friction.is_finite() && friction >= 0.0,
-        "friction coefficient",
-        friction,
-        "finite and not negative",
-    )
 }

@@ -51,31 +51,11 @@ use crate::unloaded_leg::UnloadedLeg;
 
 mod goal;
 mod law_of_level;
+pub mod reason;
+mod views;
 
 /// So many states in a row that are older than the newest one are right, and the newest one was wrong.
 const OLDER_STATES: u32 = 5;
-
-/// Reasons for refusing a state that are the controller's own ([`Command::reason`]); below 100 they are the message's.
-pub mod reason {
-    /// The measurement is too old.
-    pub const STALE: u32 = 100;
-    /// The measurement is from before the last one.
-    pub const OUT_OF_ORDER: u32 = 101;
-    /// The estimator refused it.
-    pub const ESTIMATOR: u32 = 102;
-    /// The measurement is from a time that has not come: believed, it would make all true ones look old.
-    pub const AHEAD: u32 = 103;
-    /// The prediction to the time of the command failed.
-    pub const PREDICTION: u32 = 110;
-    /// A stage of the horizon could not be simulated.
-    pub const STAGE: u32 = 111;
-    /// The Riccati recursion broke down.
-    pub const RICCATI: u32 = 112;
-    /// The constrained QP gave nothing usable.
-    pub const QP: u32 = 113;
-    /// The plan is farther from the nominal than a linearisation reaches.
-    pub const FAR: u32 = 114;
-}
 
 /// A violation beyond this part of a constraint's scale is reported as [`Verdict::Infeasible`].
 const GAVE_WAY: f64 = 1e-3;
@@ -557,61 +537,6 @@ impl Controller {
     /// Sets the plant time that counts as zero of the run; otherwise it is that of the first state.
     pub fn set_origin_ns(&mut self, origin_ns: u64) {
         self.origin_ns = Some(origin_ns);
-    }
-
-    /// Where the robot aims.
-    pub fn reference(&self) -> &Reference {
-        &self.reference
-    }
-
-    /// The plan of the last solved cycle.
-    pub fn plan(&self) -> Option<&Plan> {
-        self.has_plan.then_some(&self.plan)
-    }
-
-    /// Gain of the stage of the last factorisation.
-    pub fn gain(&self, stage: usize) -> MatRef<'_, f64> {
-        self.riccati.gain(stage)
-    }
-
-    /// The LQ problem of the last cycle.
-    pub fn problem(&self) -> &LqProblem {
-        &self.horizon.problem
-    }
-
-    /// Deviations from the nominal that solve the problem of the last cycle.
-    pub fn solution(&self) -> &Trajectory {
-        &self.solution
-    }
-
-    /// The constrained solve of the last cycle: its active rows and multipliers.
-    pub fn constrained(&self) -> &ProjectedQp {
-        &self.qp
-    }
-
-    /// State `(q, q̇)` predicted for the time the last command takes effect.
-    pub fn predicted_state(&self) -> &[f64] {
-        &self.predicted
-    }
-
-    /// Estimate from the last good measurement.
-    pub fn estimate(&self) -> &Estimate {
-        self.estimator.estimate()
-    }
-
-    /// What is believed of base and feet.
-    pub fn estimator(&self) -> &Estimator {
-        &self.estimator
-    }
-
-    /// Root mean square of the last innovation of the joint rates, rad/s.
-    pub fn innovation_rate(&self) -> f64 {
-        self.innovation_rate
-    }
-
-    /// The model.
-    pub fn model(&self) -> &ControllerModel {
-        &self.model
     }
 
     /// Plant time of a time of the run.

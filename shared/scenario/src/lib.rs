@@ -28,6 +28,7 @@
 mod document;
 mod error;
 mod fault;
+mod ground;
 mod list;
 mod plan;
 mod range;
@@ -36,9 +37,9 @@ mod scenario;
 pub use document::Document;
 pub use error::{Place, ScenarioError};
 pub use fault::{FaultKind, FaultSettings, FaultTarget};
+pub use ground::{BoxSettings, GapSettings, RobotSettings, StartSettings, TerrainSettings};
 pub use plan::{PlanBound, PlanGap, PlanObstacle, PlanSettings, PlanSpring, PlanStep, PlanWeightSettings};
 pub use scenario::{
-    BoxSettings, Clock, ConstraintSettings, ControllerKind, ControllerSettings, GapSettings, PlantSettings,
-    ProcessSettings, PushSettings, ReachSettings, RobotSettings, Scenario, SensorSettings, StartSettings,
-    SuccessSettings, TerrainSettings, TimingSettings, WeightSettings,
+    Clock, ConstraintSettings, ControllerKind, ControllerSettings, PlantSettings, ProcessSettings,
+    PushSettings, ReachSettings, Scenario, SensorSettings, SuccessSettings, TimingSettings, WeightSettings,
 };
