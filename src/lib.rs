@@ -45,6 +45,7 @@ pub mod log_command;
 pub mod log_file;
 pub mod log_queue;
 pub mod log_reader;
+mod log_schema;
 pub mod log_viewer;
 pub mod metrics;
 pub mod model;
