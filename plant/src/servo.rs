@@ -1,7 +1,7 @@
 //! The servo between commands, and the plant's own watchdog.
 //!
-//! The servo applies `u = torque + gain [q - q_ref; q̇ - q̇_ref]` of the latest command at the plant's rate, segment after segment of its
-//! plan when no other command comes. A dead controller cannot act, so the plant keeps the fallback ladder too:
+//! The servo applies the law of the latest command (`servo_law` of `delmpc_messages`: joints, inertial unit, load of the foot, velocities as
+//! means) at the plant's rate, segment after segment of its plan when no other command comes. A dead controller cannot act, so the plant keeps the fallback ladder too:
 //!
 //! | level | rule | for |
 //! |---|---|---|

@@ -16,6 +16,9 @@
 //! `q̇` and `ω` are means over the servo's last samples, as many as the command says ([`RateMean`]): what a servo answers within one of
 //! its own periods excites what it stands on at half its rate, where ground that gives lets a foot roll. `q` and `Θ` are the last ones.
 //!
+//! In `b t` the time goes on beyond the command's end. The bounds come before the share of the load, and the last line damps `q̇` itself.
+//! Means count samples from before the command, too.
+//!
 //! Without an inertial unit its term is left out, without a force sensor `s = 1`. The last line is for a foot that hops, rocks or hangs:
 //! the torque that balances 100 kg throws a foot of 2 kg by 5000 rad/s², and the gain that is right for the one makes the other chatter.
 
