@@ -10,12 +10,12 @@ use delmpc::plant_process::Plant;
 use delmpc::robot_controller::RobotController;
 use delmpc::setup::{MAIN_SCENARIO, Setup};
 use delmpc::simulated_robot::SimulatedRobot;
-use delmpc_controller_core::lq_problem::RowId;
 use delmpc_controller_core::prelude as core;
-use delmpc_controller_core::riccati::Riccati;
-use delmpc_controller_core::sparse_qp::solve_sparse;
-use delmpc_controller_core::trajectory::Trajectory;
 use delmpc_controller_process::controller_loop::Controller;
+use delmpc_lq::lq_problem::RowId;
+use delmpc_lq::riccati::Riccati;
+use delmpc_lq::sparse_qp::solve_sparse;
+use delmpc_lq::trajectory::Trajectory;
 use delmpc_messages::{Command, PlantState};
 
 const PUSH: [&str; 6] = [

@@ -6,9 +6,9 @@ use delmpc_messages::LONGEST_VALIDITY_NS;
 
 use crate::errors::ControlError;
 use crate::fallback::FallbackConfig;
-use crate::projected_qp::ProjectedQpOptions;
 use crate::reference::Reach;
 use crate::tasks::TaskWeights;
+use delmpc_lq::projected_qp::ProjectedQpOptions;
 
 /// Which law controls.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

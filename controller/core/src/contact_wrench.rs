@@ -33,9 +33,9 @@ use delmpc_messages::ConstraintKind;
 use nalgebra::Vector3;
 
 use crate::errors::ControlError;
-use crate::lq_problem::{LqStage, OutputRow, RowTag};
 use crate::node_kinematics::NodeKinematics;
-use crate::panel::Panel;
+use delmpc_lq::lq_problem::{LqStage, OutputRow, RowTag};
+use delmpc_lq::panel::Panel;
 
 /// What a flat foot can transmit.
 #[derive(Clone, Debug, PartialEq)]
@@ -95,9 +95,14 @@ impl WrenchCone {
         check("sole corners", foot.polygon.len() as f64, foot.polygon.len() >= 3, "must be at least 3")?;
 
         const LEVER: f64 = 0.1;
-        let force = |kind, row: usize| RowTag { kind, row: row as u32, penalty, scale: weight };
-        let moment = |kind, row: usize| RowTag {
-            kind,
+        let force = |kind: ConstraintKind, row: usize| RowTag {
+            label: kind as u32,
+            row: row as u32,
+            penalty,
+            scale: weight,
+        };
+        let moment = |kind: ConstraintKind, row: usize| RowTag {
+            label: kind as u32,
             row: row as u32,
             penalty: penalty / LEVER,
             scale: weight * LEVER,

@@ -27,27 +27,27 @@ use nalgebra::Vector3;
 use crate::balance_trim::BalanceTrim;
 use crate::config::{ControllerConfig, ControllerKind};
 use crate::contact_wrench::{FlatFoot, WrenchCone};
-use crate::dual_qp::QpSolver;
 use crate::errors::ControlError;
 use crate::estimator::{Estimate, Estimator};
 use crate::fallback::{Attempt, FallbackLadder, Situation};
 use crate::feedback_law::{Law, LawHistory};
 use crate::horizon_problem::HorizonProblem;
-use crate::kernels::all_finite;
-use crate::lq_problem::LqProblem;
 use crate::model::ControllerModel;
 use crate::node_kinematics::NodeKinematics;
 use crate::plan::Plan;
 use crate::posture_goal::posture_goal;
 use crate::prediction::Prediction;
-use crate::projected_qp::{ProjectedQp, ProjectedQpReport, default_backend};
 use crate::reference::{Reach, Reference};
-use crate::riccati::Riccati;
 use crate::stop_watch::StopWatch;
 pub use crate::stop_watch::{Clock, StoppedClock};
 use crate::tasks::TaskTargets;
-use crate::trajectory::Trajectory;
 use crate::unloaded_leg::UnloadedLeg;
+use delmpc_lq::dual_qp::QpSolver;
+use delmpc_lq::kernels::all_finite;
+use delmpc_lq::lq_problem::LqProblem;
+use delmpc_lq::projected_qp::{ProjectedQp, ProjectedQpReport, default_backend};
+use delmpc_lq::riccati::Riccati;
+use delmpc_lq::trajectory::Trajectory;
 
 mod goal;
 mod law_of_level;
@@ -492,7 +492,7 @@ impl Controller {
     /// The solution becomes the plan, unless it is out of reach of the linearisation.
     fn adopt_plan(&mut self) -> Result<(), u32> {
         let n = self.model.tree.dof();
-        let largest = |k: usize| crate::kernels::largest(&self.solution.x(k)[..n]);
+        let largest = |k: usize| delmpc_lq::kernels::largest(&self.solution.x(k)[..n]);
         if (0..=self.solution.stages()).any(|k| largest(k) > LARGEST_MOVE) {
             return Err(reason::FAR);
         }
@@ -511,7 +511,7 @@ impl Controller {
         out.dropped_rows = report.dropped_rows;
         if let Some(worst) = report.worst.filter(|worst| worst.amount > GAVE_WAY * worst.tag.scale) {
             out.worst_violation = worst.amount;
-            out.worst_constraint = worst.tag.kind as u32;
+            out.worst_constraint = worst.tag.label;
             out.worst_stage = u32::from(worst.row.stage);
             out.worst_row = worst.tag.row;
             if self.command.verdict == Verdict::Ok as u32 {

@@ -14,7 +14,7 @@
 //! time up to the next command. The others are for the case that it is late: a torque that is right for a stage of 5 ms, held for 20,
 //! throws the robot up. `K` is that of the first stage throughout.
 //!
-//! Source: own formulation; the gain is that of the Riccati recursion ([`crate::riccati`]). Sending the rest of the plan along against
+//! Source: own formulation; the gain is that of the Riccati recursion ([`delmpc_lq::riccati`]). Sending the rest of the plan along against
 //! lost and late commands: D. Quevedo, D. Nešić, *Robust stability of packetized predictive control*, Automatica 48, 2012.
 
 use alloc::vec;
@@ -25,8 +25,8 @@ use faer::{Mat, MatRef};
 use nalgebra::Vector3;
 
 use crate::horizon_problem::HorizonProblem;
-use crate::kernels::gemv;
-use crate::trajectory::Trajectory;
+use delmpc_lq::kernels::gemv;
+use delmpc_lq::trajectory::Trajectory;
 
 /// One segment of a [`Law`]. The reference is that of the moment it begins, from where it moves at constant acceleration.
 #[derive(Clone, Debug)]
@@ -204,7 +204,9 @@ pub(crate) fn bound_by_pressure_point(
     let stage = &problem.stages[index];
     let (u, x) = (solution.u(index), solution.x(index));
     let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-    for row in problem.output_rows.iter().filter(|row| row.tag.kind == ConstraintKind::CentreOfPressure) {
+    for row in
+        problem.output_rows.iter().filter(|row| row.tag.label == ConstraintKind::CentreOfPressure as u32)
+    {
         let value: f64 = (row.coefficients.iter().enumerate())
             .map(|(output, coefficient)| {
                 let (by_input, by_state, constant) = stage.output(output);

@@ -21,8 +21,8 @@ use delmpc_mechanics::lobatto::LobattoRule;
 use delmpc_mechanics::stage_batch::{StageBatch, StageInput, TransitionOutput, TransitionRows};
 use delmpc_mechanics::tree::KinematicTree;
 
-use crate::lq_problem::LqStage;
-use crate::trajectory::Trajectory;
+use delmpc_lq::lq_stage::{LqStage, TransitionRowsMut};
+use delmpc_lq::trajectory::Trajectory;
 
 /// Workspace of the horizon's linearisation.
 #[derive(Clone, Debug)]
@@ -37,7 +37,8 @@ struct Transitions<'a>(&'a mut [LqStage]);
 
 impl TransitionOutput for Transitions<'_> {
     fn transition(&mut self, stage: usize) -> TransitionRows<'_> {
-        self.0[stage].transition_rows()
+        let TransitionRowsMut { values, row_stride, first_state } = self.0[stage].transition_rows();
+        TransitionRows { values, row_stride, first_state }
     }
 }
 

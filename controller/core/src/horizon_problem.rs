@@ -9,30 +9,31 @@
 //! outputs      the mean wrench of the ground on the stance foot, inside its cone     (crate::contact_wrench)
 //! ```
 //!
-//! Terminal cost: that of standing at the home posture for ever ([`crate::dare`]).
+//! Terminal cost: that of standing at the home posture for ever ([`delmpc_lq::dare`]).
 
 use alloc::vec;
 use alloc::vec::Vec;
 
 use delmpc_mechanics::errors::StepError;
 use delmpc_mechanics::tree::KinematicTree;
+use delmpc_messages::ConstraintKind;
 use faer::{Accum, Mat};
 use nalgebra::Vector3;
 
 use crate::config::ControllerConfig;
 use crate::contact_wrench::{StageWrench, WrenchCone};
-use crate::dare::{InfiniteHorizon, solve_dare};
 use crate::errors::ControlError;
 use crate::horizon_dynamics::HorizonDynamics;
-use crate::kernels::gemv;
-use crate::lq_problem::{BoxBounds, LqProblem, LqSize, LqStage};
 use crate::model::ControllerModel;
 use crate::node_kinematics::NodeKinematics;
 use crate::plan::Plan;
 use crate::reference::Reference;
 use crate::stage_dynamics::StageDynamics;
 use crate::tasks::{MAX_RESIDUALS, TaskTargets, Tasks};
-use crate::trajectory::Trajectory;
+use delmpc_lq::dare::{InfiniteHorizon, solve_dare};
+use delmpc_lq::kernels::gemv;
+use delmpc_lq::lq_problem::{BoxBounds, LqProblem, LqSize, LqStage};
+use delmpc_lq::trajectory::Trajectory;
 
 /// The problem and what filling it takes.
 #[derive(Debug)]
@@ -68,6 +69,10 @@ impl HorizonProblem {
             residuals: MAX_RESIDUALS,
         });
         for j in 0..n {
+            problem.input_tags[j].label = ConstraintKind::Torque as u32;
+            problem.state_tags[j].label = ConstraintKind::JointPosition as u32;
+            problem.state_tags[n + j].label = ConstraintKind::JointVelocity as u32;
+            problem.state_tags[n + j].row = j as u32;
             problem.input_tags[j].scale = model.limits[j].effort.min(1e9);
             problem.state_tags[j].penalty = config.constraints.position_penalty;
             problem.state_tags[n + j].penalty = config.constraints.velocity_penalty;
@@ -197,7 +202,7 @@ impl HorizonProblem {
         node.update(tree, &x[..n], &x[n..])?;
         reference.sample(f64::NEG_INFINITY, &mut self.targets);
         self.tasks.quadratise(tree, node, x.split_at(n), &self.targets, duration, &mut stage.cost);
-        solve_dare(&stage)
+        Ok(solve_dare(&stage)?)
     }
 }
 

@@ -22,42 +22,26 @@ extern crate alloc;
 #[cfg(all(test, not(feature = "std")))]
 extern crate std;
 
-pub mod active_set_dual;
-mod adjoint_sweep;
 mod balance_trim;
-#[cfg(feature = "clarabel")]
-pub mod clarabel_dual;
 pub mod config;
 pub mod contact_wrench;
 pub mod cycle;
-pub mod dare;
-pub mod dual_qp;
-mod eliminate_inputs;
 pub mod errors;
 pub mod estimator;
 pub mod fallback;
 mod feedback_law;
 pub mod horizon_dynamics;
 mod horizon_problem;
-pub(crate) mod kernels;
 mod level_stance;
-pub mod lq_problem;
-pub mod lq_stage;
 pub mod model;
 pub mod node_kinematics;
-mod panel;
 pub mod plan;
 pub mod posture_goal;
 mod prediction;
-pub mod projected_qp;
 pub mod reference;
-pub mod riccati;
-#[cfg(feature = "clarabel")]
-pub mod sparse_qp;
 pub mod stage_dynamics;
 mod stop_watch;
 pub mod tasks;
-pub mod trajectory;
 mod unloaded_leg;
 
 /// What a process needs to run a controller.

@@ -5,7 +5,7 @@
 
 use alloc::vec::Vec;
 
-use crate::trajectory::Trajectory;
+use delmpc_lq::trajectory::Trajectory;
 
 /// Nominal states `(q, q̇)` and inputs, with the stage lengths.
 #[derive(Clone, Debug)]
@@ -124,7 +124,7 @@ impl Plan {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::lq_problem::LqSize;
+    use delmpc_lq::lq_problem::LqSize;
 
     /// q = t³ - t, q̇ = 3t² - 1: a cubic is reproduced exactly.
     fn cubic() -> Plan {

@@ -16,12 +16,12 @@ use delmpc_mechanics::errors::ModelError;
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
 use nalgebra::{Matrix3, Vector3};
 
-use crate::kernels::{CholeskyScratch, factor, vector_mut};
-use crate::lq_stage::{Residuals, StageCost};
 use crate::model::ControllerModel;
 use crate::node_kinematics::NodeKinematics;
 use crate::reference::PostureGoal;
 use crate::tasks::{MAX_RESIDUALS, TaskTargets, TaskWeights, Tasks};
+use delmpc_lq::kernels::{CholeskyScratch, factor, vector_mut};
+use delmpc_lq::lq_stage::{Residuals, StageCost};
 
 /// Steps of the iteration.
 const MAX_STEPS: usize = 200;

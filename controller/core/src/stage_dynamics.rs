@@ -20,7 +20,7 @@ use delmpc_mechanics::state::State;
 use delmpc_mechanics::step::{Integrator, StepOptions};
 use delmpc_mechanics::tree::KinematicTree;
 
-use crate::lq_problem::LqStage;
+use delmpc_lq::lq_problem::LqStage;
 
 /// Unknown nodes of the controller's integrator: Simpson, fourth order.
 const UNKNOWN_NODES: usize = 2;

@@ -25,9 +25,9 @@ use delmpc_mechanics::spatial::log_rotation;
 use delmpc_mechanics::tree::KinematicTree;
 use nalgebra::{Matrix3, Vector3};
 
-use crate::lq_stage::{Residuals, StageCost};
 use crate::model::BodyPoint;
 use crate::node_kinematics::NodeKinematics;
+use delmpc_lq::lq_stage::{Residuals, StageCost};
 
 /// Weights of all tasks; zero switches one off. Cost rates: see the table of the module.
 #[derive(Clone, Debug, PartialEq)]

@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod atlas;
-mod random_problem;
+mod random;
 
 use std::cell::Cell;
 
@@ -10,7 +10,7 @@ use atlas::{WeldedPlant, atlas};
 use delmpc_controller_core::cycle::reason;
 use delmpc_controller_core::prelude::*;
 use delmpc_messages::{FallbackLevel, PlantState, Verdict};
-use random_problem::Random;
+use random::Random;
 
 const PERIOD_NS: u64 = 5_000_000;
 

@@ -2,18 +2,18 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod atlas;
-mod random_problem;
+mod random;
 
 use atlas::atlas;
 use delmpc_controller_core::contact_wrench::{FlatFoot, StageWrench, WrenchCone, mean_wrench};
-use delmpc_controller_core::lq_problem::{LqProblem, LqSize};
-use delmpc_controller_core::lq_stage::Residuals;
 use delmpc_controller_core::model::ControllerModel;
 use delmpc_controller_core::node_kinematics::NodeKinematics;
 use delmpc_controller_core::stage_dynamics::StageDynamics;
 use delmpc_controller_core::tasks::{MAX_RESIDUALS, TaskTargets, TaskWeights, Tasks};
+use delmpc_lq::lq_problem::{LqProblem, LqSize};
+use delmpc_lq::lq_stage::Residuals;
 use nalgebra::Vector3;
-use random_problem::Random;
+use random::Random;
 
 /// Central differences with this step: truncation and round-off meet near 1e-9 relative.
 const STEP: f64 = 1e-5;

@@ -16,7 +16,7 @@ use super::{Controller, to_ns};
 use crate::config::ControllerKind;
 use crate::estimator::Estimate;
 use crate::feedback_law::{LawSegment, bound_by_pressure_point, write_law};
-use crate::kernels::gemv;
+use delmpc_lq::kernels::gemv;
 
 /// Part of effort over velocity limit that damps a joint on the last rungs.
 const DAMPING_FRACTION: f64 = 0.1;

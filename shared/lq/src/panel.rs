@@ -37,7 +37,7 @@ pub(crate) const fn padded(rows: usize) -> usize {
 
 /// A matrix in padded columns. Rows beyond `rows` are zero unless a kernel documents otherwise.
 #[derive(Clone, Debug)]
-pub(crate) struct Panel {
+pub struct Panel {
     data: Vec<Block>,
     /// Doubles from a column to the next.
     stride: usize,

@@ -6,18 +6,12 @@ use faer::linalg::matmul::matmul;
 use faer::{Accum, MatMut, MatRef, Par};
 
 /// `dst (+)= alpha lhs rhs`.
-pub(crate) fn gemm(
-    dst: MatMut<'_, f64>,
-    beta: Accum,
-    lhs: MatRef<'_, f64>,
-    rhs: MatRef<'_, f64>,
-    alpha: f64,
-) {
+pub fn gemm(dst: MatMut<'_, f64>, beta: Accum, lhs: MatRef<'_, f64>, rhs: MatRef<'_, f64>, alpha: f64) {
     matmul(dst, beta, lhs, rhs, alpha, Par::Seq);
 }
 
 /// `out (+)= alpha matrix x`.
-pub(crate) fn gemv(out: &mut [f64], beta: Accum, matrix: MatRef<'_, f64>, x: &[f64], alpha: f64) {
+pub fn gemv(out: &mut [f64], beta: Accum, matrix: MatRef<'_, f64>, x: &[f64], alpha: f64) {
     let (rows, columns) = (matrix.nrows(), matrix.ncols());
     debug_assert!(out.len() == rows && x.len() == columns);
     matmul(
@@ -31,7 +25,7 @@ pub(crate) fn gemv(out: &mut [f64], beta: Accum, matrix: MatRef<'_, f64>, x: &[f
 }
 
 /// `a · b`, in four sums so that additions need not wait for each other.
-pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
+pub fn dot(a: &[f64], b: &[f64]) -> f64 {
     let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<4>(), b.as_chunks::<4>());
     let mut sums = [0.0; 4];
     for (a, b) in a.iter().zip(b) {
@@ -44,27 +38,27 @@ pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
 }
 
 /// Largest magnitude; NaN counts as infinite.
-pub(crate) fn largest(values: &[f64]) -> f64 {
+pub fn largest(values: &[f64]) -> f64 {
     values.iter().fold(0.0, |m, x| if x.is_nan() { f64::INFINITY } else { m.max(x.abs()) })
 }
 
 /// Whether every entry is finite.
-pub(crate) fn all_finite(values: &[f64]) -> bool {
+pub fn all_finite(values: &[f64]) -> bool {
     values.iter().all(|x| x.is_finite())
 }
 
 /// A vector as a matrix with one column.
-pub(crate) fn vector_mut(values: &mut [f64]) -> MatMut<'_, f64> {
+pub fn vector_mut(values: &mut [f64]) -> MatMut<'_, f64> {
     let rows = values.len();
     MatMut::from_column_major_slice_mut(values, rows, 1)
 }
 
 /// Scratch memory of [`factor`].
-pub(crate) struct CholeskyScratch(MemBuffer);
+pub struct CholeskyScratch(MemBuffer);
 
 impl CholeskyScratch {
     /// For matrices up to this size.
-    pub(crate) fn new(size: usize) -> Self {
+    pub fn new(size: usize) -> Self {
         Self(MemBuffer::new(cholesky_in_place_scratch::<f64>(size.max(1), Par::Seq, Default::default())))
     }
 }
@@ -76,7 +70,7 @@ impl core::fmt::Debug for CholeskyScratch {
 }
 
 /// Cholesky factor of the lower triangle in place; `None` when it is not positive definite or not finite.
-pub(crate) fn factor(mut matrix: MatMut<'_, f64>, scratch: &mut CholeskyScratch) -> Option<()> {
+pub fn factor(mut matrix: MatMut<'_, f64>, scratch: &mut CholeskyScratch) -> Option<()> {
     let stack = MemStack::new(&mut scratch.0);
     cholesky_in_place(matrix.as_mut(), LltRegularization::default(), Par::Seq, stack, Default::default())
         .ok()?;

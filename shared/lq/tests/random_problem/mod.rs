@@ -1,9 +1,8 @@
 //! Seeded random LTV problems: an unstable system under input bounds and soft rows.
 #![allow(dead_code)]
 
-use delmpc_controller_core::lq_problem::{LqProblem, LqSize, RowTag};
-use delmpc_controller_core::lq_stage::LqStage;
-use delmpc_messages::ConstraintKind;
+use delmpc_lq::lq_problem::{LqProblem, LqSize, RowTag};
+use delmpc_lq::lq_stage::LqStage;
 
 /// A small generator (xorshift64*), so that a seed reproduces a problem.
 pub struct Random(u64);
@@ -73,8 +72,7 @@ pub fn problem(seed: u64, size: LqSize, limits: Limits) -> LqProblem {
     for (i, row) in problem.output_rows.iter_mut().enumerate() {
         row.coefficients[i] = 1.0;
         row.bound = limits.row;
-        row.tag =
-            RowTag { kind: ConstraintKind::Friction, row: i as u32, penalty: limits.penalty, scale: 1.0 };
+        row.tag = RowTag { label: 3, row: i as u32, penalty: limits.penalty, scale: 1.0 };
     }
     for i in 0..states {
         problem.terminal_hessian[(i, i)] = 1.0;

@@ -3,13 +3,13 @@
 
 mod random_problem;
 
-use delmpc_controller_core::active_set_dual::ActiveSetDual;
-use delmpc_controller_core::dare::solve_dare;
-use delmpc_controller_core::dual_qp::QpSolver;
-use delmpc_controller_core::lq_problem::{LqProblem, LqSize};
-use delmpc_controller_core::projected_qp::{ProjectedQp, ProjectedQpOptions, ProjectedQpReport};
-use delmpc_controller_core::riccati::Riccati;
-use delmpc_controller_core::trajectory::Trajectory;
+use delmpc_lq::active_set_dual::ActiveSetDual;
+use delmpc_lq::dare::solve_dare;
+use delmpc_lq::dual_qp::QpSolver;
+use delmpc_lq::lq_problem::{LqProblem, LqSize};
+use delmpc_lq::projected_qp::{ProjectedQp, ProjectedQpOptions, ProjectedQpReport};
+use delmpc_lq::riccati::Riccati;
+use delmpc_lq::trajectory::Trajectory;
 use faer::MatRef;
 use random_problem::{Limits, Random, problem, start};
 
@@ -171,8 +171,8 @@ fn without_an_active_constraint_the_answer_is_the_lqr_s() {
 #[cfg(feature = "clarabel")]
 mod against_the_oracle {
     use super::*;
-    use delmpc_controller_core::clarabel_dual::ClarabelDual;
-    use delmpc_controller_core::sparse_qp::solve_sparse;
+    use delmpc_lq::clarabel_dual::ClarabelDual;
+    use delmpc_lq::sparse_qp::solve_sparse;
 
     const TIGHT: ProjectedQpOptions =
         ProjectedQpOptions { capacity: 64, rows_per_round: 24, max_rounds: 20, tolerance: 1e-10, pivots: 12 };
@@ -268,7 +268,7 @@ fn hostile(seeds: std::ops::Range<u64>) -> u32 {
     let mut trajectory = Trajectory::new(size);
     let mut backends: Vec<Box<dyn QpSolver>> = vec![Box::new(ActiveSetDual::new(16))];
     #[cfg(feature = "clarabel")]
-    backends.push(Box::new(delmpc_controller_core::clarabel_dual::ClarabelDual::new(16, 1e-8).unwrap()));
+    backends.push(Box::new(delmpc_lq::clarabel_dual::ClarabelDual::new(16, 1e-8).unwrap()));
     let (mut solved, mut refused) = (0, 0);
     for seed in seeds {
         let mut random = Random::new(seed);

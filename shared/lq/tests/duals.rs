@@ -3,9 +3,9 @@
 
 mod random_problem;
 
-use delmpc_controller_core::active_set_dual::ActiveSetDual;
-use delmpc_controller_core::dual_qp::{QpSolver, dual_residual};
-use delmpc_controller_core::errors::QpError;
+use delmpc_lq::active_set_dual::ActiveSetDual;
+use delmpc_lq::dual_qp::{QpSolver, dual_residual};
+use delmpc_lq::errors::QpError;
 use faer::Mat;
 use random_problem::Random;
 
@@ -49,7 +49,7 @@ impl Dual {
 fn solvers() -> Vec<Box<dyn QpSolver>> {
     let mut solvers: Vec<Box<dyn QpSolver>> = vec![Box::new(ActiveSetDual::new(64))];
     #[cfg(feature = "clarabel")]
-    solvers.push(Box::new(delmpc_controller_core::clarabel_dual::ClarabelDual::new(64, 1e-8).unwrap()));
+    solvers.push(Box::new(delmpc_lq::clarabel_dual::ClarabelDual::new(64, 1e-8).unwrap()));
     solvers
 }
 

@@ -23,7 +23,6 @@
 use alloc::vec;
 use alloc::vec::Vec;
 
-use delmpc_messages::ConstraintKind;
 use faer::Mat;
 
 pub use crate::lq_stage::{BoxBounds, LqStage};
@@ -50,9 +49,9 @@ pub struct LqSize {
 /// What a constraint row is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RowTag {
-    /// What it limits.
-    pub kind: ConstraintKind,
-    /// Row within that constraint.
+    /// What it limits: the caller's own number, not read here.
+    pub label: u32,
+    /// Row within that constraint, the caller's own.
     pub row: u32,
     /// Cost per unit of violation; infinite: hard.
     pub penalty: f64,
@@ -62,7 +61,7 @@ pub struct RowTag {
 
 impl Default for RowTag {
     fn default() -> Self {
-        Self { kind: ConstraintKind::None, row: 0, penalty: f64::INFINITY, scale: 1.0 }
+        Self { label: 0, row: 0, penalty: f64::INFINITY, scale: 1.0 }
     }
 }
 
@@ -111,23 +110,15 @@ impl LqProblem {
     /// A problem of zeros, without bounds.
     pub fn new(size: LqSize) -> Self {
         let LqSize { states, inputs, stages, .. } = size;
-        let input_tag = |row| RowTag { kind: ConstraintKind::Torque, row: row as u32, ..RowTag::default() };
-        let state_tag = |row: usize| {
-            let (kind, row) = if row < states / 2 {
-                (ConstraintKind::JointPosition, row)
-            } else {
-                (ConstraintKind::JointVelocity, row - states / 2)
-            };
-            RowTag { kind, row: row as u32, ..RowTag::default() }
-        };
+        let tag = |row| RowTag { row: row as u32, ..RowTag::default() };
         Self {
             size,
             stages: vec![LqStage::new(size); stages],
             terminal_hessian: Mat::zeros(states, states),
             terminal_gradient: vec![0.0; states],
             terminal_state: BoxBounds::unbounded(states),
-            input_tags: (0..inputs).map(input_tag).collect(),
-            state_tags: (0..states).map(state_tag).collect(),
+            input_tags: (0..inputs).map(tag).collect(),
+            state_tags: (0..states).map(tag).collect(),
             output_rows: vec![
                 OutputRow {
                     coefficients: vec![0.0; size.outputs],

@@ -19,7 +19,6 @@
 use alloc::vec;
 use alloc::vec::Vec;
 
-use delmpc_mechanics::stage_batch::TransitionRows;
 use faer::{Mat, MatMut, MatRef};
 
 use crate::lq_problem::LqSize;
@@ -218,8 +217,20 @@ pub struct OutputMut<'a> {
     pub value: &'a mut f64,
 }
 
+/// `[B A]` of a stage, to write.
+#[derive(Debug)]
+pub struct TransitionRowsMut<'a> {
+    /// Rows of `[B A d]`, `row_stride` apart.
+    pub values: &'a mut [f64],
+    /// From one row to the next.
+    pub row_stride: usize,
+    /// Where the states begin in a row.
+    pub first_state: usize,
+}
+
 impl LqStage {
-    pub(crate) fn new(size: LqSize) -> Self {
+    /// A stage of zeros, without bounds.
+    pub fn new(size: LqSize) -> Self {
         let LqSize { states, inputs, outputs, residuals, .. } = size;
         let layout = Layout { inputs, states };
         Self {
@@ -263,10 +274,11 @@ impl LqStage {
         self.transition.column_mut(state)[one] = value;
     }
 
-    /// `[B A]` as a linearisation of the whole horizon writes it.
-    pub fn transition_rows(&mut self) -> TransitionRows<'_> {
+    /// `[B A]` as a linearisation of the whole horizon writes it: row i of a transition from `i * row_stride` on, the inputs first,
+    /// the states from `first_state` on.
+    pub fn transition_rows(&mut self) -> TransitionRowsMut<'_> {
         let (row_stride, first_state) = (self.transition.stride(), self.layout.first_state());
-        TransitionRows { values: self.transition.entries_mut(), row_stride, first_state }
+        TransitionRowsMut { values: self.transition.entries_mut(), row_stride, first_state }
     }
 
     /// An output, to write.
@@ -286,7 +298,7 @@ impl LqStage {
     }
 
     /// Sets the outputs to `y = Y (A x + B u + d)`, `Y` given with one state a column: up to a tile of them.
-    pub(crate) fn set_outputs_through_transition(&mut self, by_end_state: &Panel) {
+    pub fn set_outputs_through_transition(&mut self, by_end_state: &Panel) {
         times_transposed(&self.transition, by_end_state, &mut self.outputs);
     }
 

@@ -30,7 +30,7 @@ use faer::{Mat, MatRef};
 use pulp::Arch;
 
 use crate::eliminate_inputs::{EliminateInputs, Scratch, StageFactors};
-use crate::errors::ControlError;
+use crate::errors::LqError;
 use crate::kernels::dot;
 use crate::lq_problem::{LqProblem, LqSize};
 use crate::lq_stage::Layout;
@@ -73,8 +73,8 @@ impl Riccati {
     /// Backward sweep over all stages.
     ///
     /// # Errors
-    /// [`ControlError::NotPositiveDefinite`] when `H_k` has no Cholesky factor (or holds a NaN).
-    pub fn factorise(&mut self, problem: &LqProblem) -> Result<(), ControlError> {
+    /// [`LqError::NotPositiveDefinite`] when `H_k` has no Cholesky factor (or holds a NaN).
+    pub fn factorise(&mut self, problem: &LqProblem) -> Result<(), LqError> {
         let LqSize { states, inputs, stages, .. } = self.size;
         for column in 0..states {
             let target = self.cost_to_go.column_mut(column);
@@ -98,7 +98,7 @@ impl Riccati {
                 factors: &mut self.factors[k],
             };
             if !self.arch.dispatch(stage) {
-                return Err(ControlError::NotPositiveDefinite { stage: k });
+                return Err(LqError::NotPositiveDefinite { stage: k });
             }
         }
         Ok(())

@@ -18,7 +18,7 @@ use alloc::vec;
 use faer::linalg::solvers::{PartialPivLu, Solve};
 use faer::{Accum, Mat, MatRef};
 
-use crate::errors::ControlError;
+use crate::errors::LqError;
 use crate::kernels::gemm;
 use crate::lq_problem::{LqProblem, LqSize, LqStage};
 use crate::riccati::Riccati;
@@ -42,13 +42,13 @@ pub struct InfiniteHorizon {
 /// Infinite-horizon cost and gain for the transition and the quadratic cost of `stage`, repeated for ever.
 ///
 /// # Errors
-/// [`ControlError::NotPositiveDefinite`] when a weight of `R` is not positive; [`ControlError::NoStabilisingSolution`] when the
+/// [`LqError::NotPositiveDefinite`] when a weight of `R` is not positive; [`LqError::NoStabilisingSolution`] when the
 /// doubling does not converge.
-pub fn solve_dare(stage: &LqStage) -> Result<InfiniteHorizon, ControlError> {
+pub fn solve_dare(stage: &LqStage) -> Result<InfiniteHorizon, LqError> {
     let (a, b) = (stage.a(), stage.b());
     let states = a.nrows();
     if !stage.cost.input_weight.iter().all(|weight| *weight > 0.0) {
-        return Err(ControlError::NotPositiveDefinite { stage: 0 });
+        return Err(LqError::NotPositiveDefinite { stage: 0 });
     }
     let mut h = stage.cost.state_hessian();
     let scaled: Mat<f64> = Mat::from_fn(states, b.ncols(), |i, j| b[(i, j)] / stage.cost.input_weight[j]);
@@ -71,7 +71,7 @@ pub fn solve_dare(stage: &LqStage) -> Result<InfiniteHorizon, ControlError> {
         let size = largest(h.as_ref()).max(f64::MIN_POSITIVE);
         change = largest(increment.as_ref()) / size;
         if !change.is_finite() {
-            return Err(ControlError::NoStabilisingSolution { iterations: doubling, change });
+            return Err(LqError::NoStabilisingSolution { iterations: doubling, change });
         }
         add_symmetric(&mut h, &increment);
         if change <= CONVERGED {
@@ -79,7 +79,7 @@ pub fn solve_dare(stage: &LqStage) -> Result<InfiniteHorizon, ControlError> {
             return if change <= RESIDUAL {
                 Ok(solution)
             } else {
-                Err(ControlError::NoStabilisingSolution { iterations: doubling, change })
+                Err(LqError::NoStabilisingSolution { iterations: doubling, change })
             };
         }
         gemm(product.as_mut(), Accum::Replace, wg.as_ref(), a_j.as_ref().transpose(), 1.0);
@@ -88,11 +88,11 @@ pub fn solve_dare(stage: &LqStage) -> Result<InfiniteHorizon, ControlError> {
         gemm(product.as_mut(), Accum::Replace, a_j.as_ref(), wa.as_ref(), 1.0);
         core::mem::swap(&mut a_j, &mut product);
     }
-    Err(ControlError::NoStabilisingSolution { iterations: MAX_DOUBLINGS, change })
+    Err(LqError::NoStabilisingSolution { iterations: MAX_DOUBLINGS, change })
 }
 
 /// The gain that belongs to `P`, by one stage of the recursion, and by how much that stage changes `P`.
-fn finish(stage: &LqStage, cost_to_go: Mat<f64>, change: &mut f64) -> Result<InfiniteHorizon, ControlError> {
+fn finish(stage: &LqStage, cost_to_go: Mat<f64>, change: &mut f64) -> Result<InfiniteHorizon, LqError> {
     let (states, inputs) = (stage.a().nrows(), stage.b().ncols());
     let mut problem = LqProblem::new(LqSize { states, inputs, stages: 1, ..LqSize::default() });
     problem.stages[0].clone_from(stage);

@@ -1,6 +1,6 @@
 //! Time of the Riccati recursion and of its parts for Atlas' sizes: 60 states, 30 inputs, 20 stages.
 //!
-//! `cargo bench -p delmpc-controller-core --bench riccati`. Median and least of many calls; times depend on the machine.
+//! `cargo bench -p delmpc-lq --bench riccati`. Median and least of many calls; times depend on the machine.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 #[path = "../tests/random_problem/mod.rs"]
@@ -9,9 +9,9 @@ mod random_problem;
 use std::hint::black_box;
 use std::time::Instant;
 
-use delmpc_controller_core::lq_problem::LqSize;
-use delmpc_controller_core::riccati::Riccati;
-use delmpc_controller_core::trajectory::Trajectory;
+use delmpc_lq::lq_problem::LqSize;
+use delmpc_lq::riccati::Riccati;
+use delmpc_lq::trajectory::Trajectory;
 use random_problem::{Limits, problem};
 
 /// Median and least time of a call, µs.
