@@ -157,11 +157,7 @@ impl WrenchCone {
 
     /// The rows on the outputs of a stage, of which the wrench is the first six.
     pub fn output_rows(&self) -> impl Iterator<Item = OutputRow> + '_ {
-        self.rows.iter().map(|row| OutputRow {
-            coefficients: row.coefficients.to_vec(),
-            bound: row.bound,
-            tag: row.tag,
-        })
+        self.rows.iter().map(|row| OutputRow { coefficients: row.coefficients.to_vec(), tag: row.tag })
     }
 }
 

@@ -204,8 +204,11 @@ pub(crate) fn bound_by_pressure_point(
     let stage = &problem.stages[index];
     let (u, x) = (solution.u(index), solution.x(index));
     let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-    for row in
-        problem.output_rows.iter().filter(|row| row.tag.label == ConstraintKind::CentreOfPressure as u32)
+    for (row, bound) in problem
+        .output_rows
+        .iter()
+        .zip(&stage.row_bounds)
+        .filter(|(row, _)| row.tag.label == ConstraintKind::CentreOfPressure as u32)
     {
         let value: f64 = (row.coefficients.iter().enumerate())
             .map(|(output, coefficient)| {
@@ -225,7 +228,7 @@ pub(crate) fn bound_by_pressure_point(
                 .map(|(coefficient, change)| coefficient * change)
                 .sum();
             // A plan that gives way itself is not cut further than the force asks.
-            let room = ((row.bound - value).max(0.0) - change.max(0.0)) / by_torque;
+            let room = ((bound - value).max(0.0) - change.max(0.0)) / by_torque;
             let (planned, lower, upper) = (law.torque[j], &mut law.lower[j], &mut law.upper[j]);
             if by_torque > 0.0 {
                 *upper = upper.min(planned + room).max(*lower);

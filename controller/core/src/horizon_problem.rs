@@ -67,6 +67,7 @@ impl HorizonProblem {
             outputs: if cone.is_some() { 6 } else { 0 },
             rows: cone.map_or(0, |cone| cone.rows().len()),
             residuals: MAX_RESIDUALS,
+            squares: 0,
         });
         for j in 0..n {
             problem.input_tags[j].label = ConstraintKind::Torque as u32;
@@ -80,6 +81,9 @@ impl HorizonProblem {
         }
         if let Some(cone) = cone {
             problem.output_rows = cone.output_rows().collect();
+            for stage in &mut problem.stages {
+                stage.row_bounds.iter_mut().zip(cone.rows()).for_each(|(bound, row)| *bound = row.bound);
+            }
         }
         // Without a limit, 100 N·m stands for one.
         let effort = |limit: f64| if limit.is_finite() { limit } else { 100.0 };

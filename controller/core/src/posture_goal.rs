@@ -91,7 +91,7 @@ pub fn reach_posture(
             Ok(tasks.weights.posture * posture + cartesian)
         };
     let mut q = home.q.clone();
-    let mut cost = StageCost::new(n, 2 * n, MAX_RESIDUALS);
+    let mut cost = StageCost::new(n, 2 * n, MAX_RESIDUALS, 0);
     let mut best = value(&q, &mut cost.residuals, &mut node)?;
     let mut damping = 1.0;
     let mut scratch = CholeskyScratch::new(n);

@@ -30,7 +30,7 @@ fn time(mut call: impl FnMut()) -> (f64, f64) {
 fn main() {
     println!("stages  factorise µs (least)   GFLOP/s   rollout µs");
     for stages in [5, 10, 20, 40] {
-        let size = LqSize { states: 60, inputs: 30, stages, outputs: 0, rows: 0, residuals: 15 };
+        let size = LqSize { states: 60, inputs: 30, stages, outputs: 0, rows: 0, residuals: 15, squares: 0 };
         let problem = problem(1, size, Limits::NONE);
         let mut riccati = Riccati::new(size);
         let mut trajectory = Trajectory::new(size);

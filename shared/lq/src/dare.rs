@@ -42,11 +42,15 @@ pub struct InfiniteHorizon {
 /// Infinite-horizon cost and gain for the transition and the quadratic cost of `stage`, repeated for ever.
 ///
 /// # Errors
-/// [`LqError::NotPositiveDefinite`] when a weight of `R` is not positive; [`LqError::NoStabilisingSolution`] when the
+/// [`LqError::CrossTerms`] for a stage with squares; [`LqError::NotPositiveDefinite`] when a weight of `R` is not positive; [`LqError::NoStabilisingSolution`] when the
 /// doubling does not converge.
 pub fn solve_dare(stage: &LqStage) -> Result<InfiniteHorizon, LqError> {
     let (a, b) = (stage.a(), stage.b());
     let states = a.nrows();
+    let count = stage.cost.squares.len();
+    if count > 0 {
+        return Err(LqError::CrossTerms { count });
+    }
     if !stage.cost.input_weight.iter().all(|weight| *weight > 0.0) {
         return Err(LqError::NotPositiveDefinite { stage: 0 });
     }

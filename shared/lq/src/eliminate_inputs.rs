@@ -3,7 +3,7 @@
 //! Letters and equations: [`crate::riccati`]. Rows of the panels are `(u, x, 1)`; the row of 1 carries the linear terms.
 //!
 //! ```text
-//! W = T' P      (L; Y') L' = columns of u of [R 0; 0 Q] + T' W'      P_k = D + J'J - Y'Y + T_x' W_x'      K' = -Y' L⁻¹
+//! W = T' P      (L; Y') L' = columns of u of [R 0; 0 Q] + Z'Z + T' W'      P_k = D + J'J + Z_x'Z_x - Y'Y + T_x' W_x'      K' = -Y' L⁻¹
 //! ```
 //!
 //! `R` and `D` are diagonal, so they are added where the products have been stored.
@@ -14,7 +14,7 @@ use core::ops::Range;
 
 use pulp::{Simd, WithSimd};
 
-use crate::lq_stage::{Layout, LqStage};
+use crate::lq_stage::{Layout, LqStage, Squares};
 use crate::panel::{
     BLOCK, Panel, TILE, Tile, Tiled, accumulate, accumulate_columns, fill, load_tile, mirror_diagonal_tiles,
     sqrt, store, zero_tile,
@@ -102,8 +102,9 @@ impl Tiled for Propagated<'_> {
     }
 }
 
-/// The columns of `u` of `T' W'`.
+/// The columns of `u` of `Z'Z + T' W'`.
 struct InputColumns<'a> {
+    squares: &'a Squares,
     transition: &'a Panel,
     propagated: &'a Panel,
 }
@@ -111,14 +112,16 @@ struct InputColumns<'a> {
 impl Tiled for InputColumns<'_> {
     #[inline(always)]
     fn tile<S: Simd, const R: usize>(&self, simd: S, row: usize, column: usize) -> Tile<S, R> {
-        let Self { transition, propagated } = *self;
+        let Self { squares, transition, propagated } = *self;
         let mut tile = zero_tile::<S, R>(simd);
+        let panel = squares.panel();
+        accumulate(simd, &mut tile, (panel, row), (panel, column), 0..squares.len());
         accumulate(simd, &mut tile, (transition, row), (propagated, column), 0..propagated.columns());
         tile
     }
 }
 
-/// `J'J - Y'Y + T_x' W_x'`.
+/// `J'J + Z_x'Z_x - Y'Y + T_x' W_x'`.
 struct CostToGo<'a> {
     layout: Layout,
     stage: &'a LqStage,
@@ -142,6 +145,8 @@ impl Tiled for CostToGo<'_> {
         let residuals = &stage.cost.residuals;
         let squares = residuals.panel();
         accumulate(simd, &mut tile, (squares, row), (squares, column), 0..residuals.len());
+        let squares = &stage.cost.squares;
+        accumulate(simd, &mut tile, (squares.panel(), below), (squares.panel(), beyond), 0..squares.len());
         accumulate(simd, &mut tile, (stage.transition(), below), (propagated, beyond), 0..layout.states);
         tile
     }
@@ -163,8 +168,10 @@ impl EliminateInputs<'_> {
         let transition = self.stage.transition();
         let Scratch { propagated, elimination, carried_gradient } = &mut *self.scratch;
         let rows = 0..transition.stride() / S::F64_LANES;
-        fill(simd, &InputColumns { transition, propagated }, elimination, rows, 0..inputs, true);
-        let (cost, carried) = (&self.stage.cost, carried_gradient.column(0));
+        let cost = &self.stage.cost;
+        let squares = &cost.squares;
+        fill(simd, &InputColumns { squares, transition, propagated }, elimination, rows, 0..inputs, true);
+        let carried = carried_gradient.column(0);
         for u in 0..inputs {
             let entries = elimination.column_mut(u);
             entries[u] += cost.input_weight[u];
@@ -204,7 +211,7 @@ impl EliminateInputs<'_> {
         true
     }
 
-    /// `P_k = D + J'J - Y'Y + T_x' W_x'`, lower triangle and tiles of the diagonal; below it `p_k'`.
+    /// `P_k = D + J'J + Z_x'Z_x - Y'Y + T_x' W_x'`, lower triangle and tiles of the diagonal; below it `p_k'`.
     #[inline(always)]
     fn cost_to_go<S: Simd>(&mut self, simd: S) {
         let Layout { states, .. } = self.layout;

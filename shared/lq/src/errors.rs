@@ -10,6 +10,14 @@ pub enum LqError {
         /// Stage of the horizon.
         stage: usize,
     },
+    /// The infinite-horizon problem is solved for costs of state and input apart.
+    #[error(
+        "the stage has {count} residuals of state and input together: the infinite-horizon problem takes none"
+    )]
+    CrossTerms {
+        /// How many it has.
+        count: usize,
+    },
     /// The infinite-horizon problem has no stabilising solution.
     #[error(
         "the terminal Riccati equation did not converge in {iterations} doublings (last change {change:e}): posture or weights leave a mode without control"

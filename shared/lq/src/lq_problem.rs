@@ -42,8 +42,10 @@ pub struct LqSize {
     pub outputs: usize,
     /// Rows on the outputs of a stage.
     pub rows: usize,
-    /// Room for squared residuals in the cost of a stage.
+    /// Room for squared residuals of the state in the cost of a stage.
     pub residuals: usize,
+    /// Room for squared residuals of state and input in it.
+    pub squares: usize,
 }
 
 /// What a constraint row is.
@@ -65,13 +67,11 @@ impl Default for RowTag {
     }
 }
 
-/// One row `coefficients · y <= bound` on the outputs of every stage.
+/// One row `coefficients · y <= bound` on the outputs of a stage; the bound is the stage's ([`LqStage::row_bounds`]).
 #[derive(Clone, Debug, PartialEq)]
 pub struct OutputRow {
     /// On the outputs.
     pub coefficients: Vec<f64>,
-    /// Right-hand side.
-    pub bound: f64,
     /// What the row is.
     pub tag: RowTag,
 }
@@ -92,7 +92,7 @@ pub struct LqProblem {
     pub input_tags: Vec<RowTag>,
     /// Tag of the bounds of every state.
     pub state_tags: Vec<RowTag>,
-    /// Rows on the outputs, the same in every stage.
+    /// Rows on the outputs, the same in every stage but for their bounds.
     pub output_rows: Vec<OutputRow>,
 }
 
@@ -120,11 +120,7 @@ impl LqProblem {
             input_tags: (0..inputs).map(tag).collect(),
             state_tags: (0..states).map(tag).collect(),
             output_rows: vec![
-                OutputRow {
-                    coefficients: vec![0.0; size.outputs],
-                    bound: f64::INFINITY,
-                    tag: RowTag::default(),
-                };
+                OutputRow { coefficients: vec![0.0; size.outputs], tag: RowTag::default() };
                 size.rows
             ],
         }
@@ -183,7 +179,7 @@ impl LqProblem {
                 self.stages.get(node).map_or(f64::INFINITY, |stage| {
                     let constant =
                         |(output, coefficient): (usize, &f64)| coefficient * stage.output(output).2;
-                    row.bound - row.coefficients.iter().enumerate().map(constant).sum::<f64>()
+                    stage.row_bounds[index] - row.coefficients.iter().enumerate().map(constant).sum::<f64>()
                 })
             }
         }
@@ -216,9 +212,12 @@ impl LqProblem {
             let first = 2 * (inputs + states);
             let Some(stage) = self.stages.get(node) else { continue };
             transposed_times(stage.outputs(), trajectory.z(node), outputs);
-            for (i, row) in self.output_rows.iter().enumerate() {
+            for (i, (row, bound)) in self.output_rows.iter().zip(&stage.row_bounds).enumerate() {
+                if *bound == f64::INFINITY {
+                    continue;
+                }
                 let value: f64 = row.coefficients.iter().zip(&*outputs).map(|(c, y)| c * y).sum();
-                check(first + i, value - row.bound, row.tag.scale);
+                check(first + i, value - bound, row.tag.scale);
             }
         }
     }

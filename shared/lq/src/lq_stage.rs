@@ -11,8 +11,11 @@
 //! The cost is a sum of weighted squares, as tasks are: a diagonal on `u`, a diagonal on `x`, and residuals `r = J x + r̄`,
 //!
 //! ```text
-//! ½ Σ R_i u_i² + g_u'u + ½ Σ D_i x_i² + g_x'x + ½ Σ_r (J_r x + r̄_r)²        Q = D + J'J,   q = g_x + J'r̄
+//! ½ Σ R_i u_i² + g_u'u + ½ Σ D_i x_i² + g_x'x + ½ Σ_r (J_r x + r̄_r)² + ½ Σ_s (Z_s z + z̄_s)²
 //! ```
+//!
+//! The first residuals are those of the state, as tasks have them, `Q = D + J'J`, `q = g_x + J'r̄`; the second ones ("squares") those
+//! of state and input together, as contact forces have them.
 //!
 //! `Q` is never formed: the recursion adds `J'J` where it adds the products of its own (`crate::eliminate_inputs`).
 
@@ -133,6 +136,65 @@ impl Residuals {
     }
 }
 
+/// Residuals `Z z + z̄` of state and input whose squares, halved, are part of a cost.
+#[derive(Clone, Debug)]
+pub struct Squares {
+    /// Column per residual: `(Z_u, Z_x, z̄)'` over the rows of `z̃`.
+    panel: Panel,
+    layout: Layout,
+    count: usize,
+}
+
+impl Squares {
+    fn new(layout: Layout, room: usize) -> Self {
+        Self { panel: Panel::zeros(layout.rows(), room), layout, count: 0 }
+    }
+
+    /// Forgets all.
+    pub fn clear(&mut self) {
+        self.count = 0;
+    }
+
+    /// Appends `weight (C z + c - target)` for an output `(C_u, C_x, c)`; `false`: no room.
+    pub fn push(&mut self, weight: f64, (by_input, by_state, value): (&[f64], &[f64], f64)) -> bool {
+        if self.count == self.panel.columns() {
+            return false;
+        }
+        let (first, one) = (self.layout.first_state(), self.layout.one());
+        let column = self.panel.column_mut(self.count);
+        self.count += 1;
+        for (target, source) in column[..by_input.len()].iter_mut().zip(by_input) {
+            *target = weight * source;
+        }
+        for (target, source) in column[first..first + by_state.len()].iter_mut().zip(by_state) {
+            *target = weight * source;
+        }
+        column[one] = weight * value;
+        true
+    }
+
+    /// How many there are.
+    pub fn len(&self) -> usize {
+        self.count
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.count == 0
+    }
+
+    /// `(Z_u, Z_x, z̄)` of a residual.
+    pub fn row(&self, residual: usize) -> (&[f64], &[f64], f64) {
+        let column = self.panel.column(residual);
+        let (first, one) = (self.layout.first_state(), self.layout.one());
+        (&column[..self.layout.inputs], &column[first..one], column[one])
+    }
+
+    pub(crate) fn panel(&self) -> &Panel {
+        &self.panel
+    }
+}
+
 /// Cost of a stage; see the module.
 #[derive(Clone, Debug)]
 pub struct StageCost {
@@ -146,21 +208,24 @@ pub struct StageCost {
     pub state_gradient: Vec<f64>,
     /// `J, r̄`.
     pub residuals: Residuals,
+    /// `Z, z̄`.
+    pub squares: Squares,
 }
 
 impl StageCost {
     /// Zero.
-    pub fn new(inputs: usize, states: usize, residuals: usize) -> Self {
+    pub fn new(inputs: usize, states: usize, residuals: usize, squares: usize) -> Self {
         Self {
             input_weight: vec![0.0; inputs],
             input_gradient: vec![0.0; inputs],
             state_weight: vec![0.0; states],
             state_gradient: vec![0.0; states],
             residuals: Residuals::new(states, residuals),
+            squares: Squares::new(Layout { inputs, states }, squares),
         }
     }
 
-    /// `Q = D + J'J`, full symmetric. Allocates: for start-up, oracles and tests.
+    /// `Q = D + J'J` without the squares, full symmetric. Allocates: for start-up, oracles and tests.
     pub fn state_hessian(&self) -> Mat<f64> {
         let states = self.state_weight.len();
         let mut hessian =
@@ -176,7 +241,7 @@ impl StageCost {
         hessian
     }
 
-    /// `q = g_x + J'r̄`. Allocates.
+    /// `q = g_x + J'r̄` without the squares. Allocates.
     pub fn state_linear_term(&self) -> Vec<f64> {
         let mut gradient = self.state_gradient.clone();
         for r in 0..self.residuals.len() {
@@ -204,6 +269,8 @@ pub struct LqStage {
     /// Bounds on the state at the start of the stage (stage 0: not read); soft or hard by
     /// [`crate::lq_problem::LqProblem::state_tags`].
     pub state: BoxBounds,
+    /// Right-hand sides of the rows on the outputs; infinite: the stage does not have the row.
+    pub row_bounds: Vec<f64>,
 }
 
 /// One output `y = C_u u + C_x x + c` of a stage, to write.
@@ -231,15 +298,16 @@ pub struct TransitionRowsMut<'a> {
 impl LqStage {
     /// A stage of zeros, without bounds.
     pub fn new(size: LqSize) -> Self {
-        let LqSize { states, inputs, outputs, residuals, .. } = size;
+        let LqSize { states, inputs, outputs, rows, residuals, squares, .. } = size;
         let layout = Layout { inputs, states };
         Self {
             layout,
             transition: Panel::zeros(layout.rows(), states),
             outputs: Panel::zeros(layout.rows(), outputs),
-            cost: StageCost::new(inputs, states, residuals),
+            cost: StageCost::new(inputs, states, residuals, squares),
             input: BoxBounds::unbounded(inputs),
             state: BoxBounds::unbounded(states),
+            row_bounds: vec![f64::INFINITY; rows],
         }
     }
 

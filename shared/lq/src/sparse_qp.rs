@@ -44,6 +44,22 @@ pub fn solve_sparse(
             hessian.add(u_at(k) + j, u_at(k) + j, unit * unit * weight);
             gradient[u_at(k) + j] += unit * linear;
         }
+        for s in 0..stage.cost.squares.len() {
+            // On all of (u, x): a row of the first stage has its state given.
+            let (by_input, by_state, constant) = stage.cost.squares.row(s);
+            let given: f64 = if k == 0 { by_state.iter().zip(&start).map(|(c, x)| c * x).sum() } else { 0.0 };
+            let mut row: Vec<(usize, f64)> =
+                by_input.iter().enumerate().map(|(j, c)| (u_at(k) + j, unit(k, j) * c)).collect();
+            if k > 0 {
+                row.extend(by_state.iter().enumerate().map(|(i, c)| (x_at(k) + i, *c)));
+            }
+            for (i, (at, c)) in row.iter().enumerate() {
+                gradient[*at] += c * (constant + given);
+                for (other, d) in &row[i..] {
+                    hessian.add(*at, *other, c * d);
+                }
+            }
+        }
         if k == 0 {
             continue;
         }

@@ -6,6 +6,7 @@ mod random_problem;
 use delmpc_lq::active_set_dual::ActiveSetDual;
 use delmpc_lq::dare::solve_dare;
 use delmpc_lq::dual_qp::QpSolver;
+use delmpc_lq::errors::LqError;
 use delmpc_lq::lq_problem::{LqProblem, LqSize};
 use delmpc_lq::projected_qp::{ProjectedQp, ProjectedQpOptions, ProjectedQpReport};
 use delmpc_lq::riccati::Riccati;
@@ -13,7 +14,8 @@ use delmpc_lq::trajectory::Trajectory;
 use faer::MatRef;
 use random_problem::{Limits, Random, problem, start};
 
-const SIZE: LqSize = LqSize { states: 8, inputs: 3, stages: 12, outputs: 4, rows: 4, residuals: 9 };
+const SIZE: LqSize =
+    LqSize { states: 8, inputs: 3, stages: 12, outputs: 4, rows: 4, residuals: 9, squares: 3 };
 
 fn solve(
     problem: &LqProblem,
@@ -55,12 +57,21 @@ fn cost_gradient(problem: &LqProblem, t: &Trajectory) -> (f64, Vec<f64>) {
             cost += u[j] * (0.5 * weight * u[j] + linear);
             gradient[k * inputs + j] = weight * u[j] + linear + through(j, stage.b());
         }
+        let mut by_squares = vec![0.0; states];
+        for s in 0..stage.cost.squares.len() {
+            let (by_input, by_state, constant) = stage.cost.squares.row(s);
+            let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+            let value = dot(by_input, u) + dot(by_state, x) + constant;
+            cost += 0.5 * value * value - 0.5 * constant * constant;
+            by_input.iter().enumerate().for_each(|(j, c)| gradient[k * inputs + j] += c * value);
+            by_squares.iter_mut().zip(by_state).for_each(|(g, c)| *g += c * value);
+        }
         let (hessian, linear) = (stage.cost.state_hessian(), stage.cost.state_linear_term());
         let next: Vec<f64> = (0..states)
             .map(|i| {
                 let hx: f64 = (0..states).map(|j| hessian[(i, j)] * x[j]).sum();
                 cost += x[i] * (0.5 * hx + linear[i]);
-                hx + linear[i] + through(i, stage.a())
+                hx + linear[i] + by_squares[i] + through(i, stage.a())
             })
             .collect();
         adjoint = next;
@@ -123,7 +134,9 @@ fn the_cost_to_go_is_the_cost_that_follows() {
 
 #[test]
 fn doubling_solves_the_infinite_horizon_equation() {
-    let problem = problem(7, SIZE, Limits::NONE);
+    let mut problem = problem(7, SIZE, Limits::NONE);
+    assert_eq!(solve_dare(&problem.stages[0]).unwrap_err(), LqError::CrossTerms { count: SIZE.squares });
+    problem.stages[0].cost.squares.clear();
     let stage = &problem.stages[0];
     let solution = solve_dare(stage).unwrap();
     // One stage of the recursion must leave it as it is.
@@ -150,7 +163,8 @@ fn a_mode_without_control_has_no_infinite_horizon_cost() {
     for j in 0..SIZE.states {
         stage.a_mut()[(0, j)] = if j == 0 { 1.1 } else { 0.0 };
     }
-    assert!(solve_dare(stage).is_err());
+    stage.cost.squares.clear();
+    assert!(matches!(solve_dare(stage), Err(LqError::NoStabilisingSolution { .. })));
 }
 
 #[test]
@@ -261,7 +275,7 @@ fn a_hundred_thousand_hostile_problems() {
 /// Infeasible, badly scaled, rank-deficient, not finite; returns how many were solved, each by every backend with and without pivoting
 /// and twice: from the active rows of the problem before, and from its own.
 fn hostile(seeds: std::ops::Range<u64>) -> u32 {
-    let size = LqSize { states: 4, inputs: 2, stages: 6, outputs: 3, rows: 3, residuals: 5 };
+    let size = LqSize { states: 4, inputs: 2, stages: 6, outputs: 3, rows: 3, residuals: 5, squares: 0 };
     let mut riccati = Riccati::new(size);
     let options = |pivots| ProjectedQpOptions { capacity: 16, pivots, ..Default::default() };
     let mut qps = [12, 0].map(|pivots| ProjectedQp::new(size, options(pivots)));
@@ -281,7 +295,7 @@ fn hostile(seeds: std::ops::Range<u64>) -> u32 {
         };
         let mut problem = problem(seed, size, limits);
         if seed % 7 == 2 {
-            problem.output_rows[0].bound = f64::NEG_INFINITY;
+            problem.stages.iter_mut().for_each(|stage| stage.row_bounds[0] = f64::NEG_INFINITY);
         }
         for stage in &mut problem.stages {
             match seed % 7 {

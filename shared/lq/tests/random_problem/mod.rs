@@ -59,6 +59,15 @@ pub fn problem(seed: u64, size: LqSize, limits: Limits) -> LqProblem {
         while let Some(row) = stage.cost.residuals.push(0.05 * random.signed()) {
             row.iter_mut().for_each(|entry| *entry = (0.1 / states as f64).sqrt() * random.signed());
         }
+        stage.row_bounds.fill(limits.row);
+        let mut row = vec![0.0; size.inputs + states];
+        loop {
+            row.iter_mut().for_each(|entry| *entry = 0.2 * random.signed());
+            let value = 0.1 * random.signed();
+            if !stage.cost.squares.push(1.0, (&row[..size.inputs], &row[size.inputs..], value)) {
+                break;
+            }
+        }
         stage.input.upper.fill(limits.input);
         stage.input.lower.fill(-limits.input);
         stage.state.upper.fill(limits.state);
@@ -71,7 +80,6 @@ pub fn problem(seed: u64, size: LqSize, limits: Limits) -> LqProblem {
     }
     for (i, row) in problem.output_rows.iter_mut().enumerate() {
         row.coefficients[i] = 1.0;
-        row.bound = limits.row;
         row.tag = RowTag { label: 3, row: i as u32, penalty: limits.penalty, scale: 1.0 };
     }
     for i in 0..states {
