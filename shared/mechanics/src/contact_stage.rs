@@ -29,8 +29,10 @@
 //! ```text
 //! [J 𝒜; 𝒢 ρσ] [δΞ; δΛ] = -[r; h] - [R_x; H_x] x - [R_u; 0] u        X = J⁻¹𝒜,  (𝒢X - ρσ) δΛ = 𝒢Z + h + H_x x,  δΞ = Z - X δΛ
 //! x'_raw = T⁻¹(e + Φ_x x + Φ_u u + Φ_Ξ δΞ + Φ_Λ δΛ)                  T, Y, W, y at the next boundary state
-//! δλ^s = -W⁻¹(y + Y x'_raw),    x_{k+1} = x'_raw + [0; 𝓜⁻¹G^T] δλ^s = A x + B u + d,     f = f_0 + F_x x + F_u u
+//! δλ^s = -W⁻¹(y + Y x'_raw),    x_{k+1} = x'_raw + [0; 𝓜⁻¹G_s^T] δλ^s = A x + B u + d,     f = f_0 + F_x x + F_u u
 //! ```
+//!
+//! where `W = G 𝓜⁻¹ G_s^T` with the force map `G_s` at node s.
 //!
 //! **Dependent rows** (several points of one body, straight knees): proximal regularisation ρ, `σ = Δt tr(W)/m`, and `ρ tr(W)/m` in the end
 //! projection. It acts on the change of the multipliers, so there is no bias at convergence; 1e-8 serves.

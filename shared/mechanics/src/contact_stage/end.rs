@@ -13,9 +13,9 @@
 use alloc::vec::Vec;
 use nalgebra::{Matrix6, Vector6};
 
-use super::right_hand_sides::shift_gain;
+use super::right_hand_sides::{joint_twist, shift_gain};
 use super::row_product::{AddDense, AddProduct, SolveRows};
-use super::{BoundaryState, ContactStage, LiftedStage, StageNominal};
+use super::{BoundaryState, ContactProjection, ContactStage, LiftedStage, StageNominal};
 use crate::errors::StepError;
 use crate::linearize::SolveMass;
 use crate::newton_direction::{NewtonDirection, base_matrix};
@@ -342,6 +342,7 @@ impl ContactStage {
             }
             first += count;
         }
+        self.factor_end_responses(tree)?;
         let instructions = self.del.instructions;
         instructions.dispatch_wide(AddProduct {
             matrix: &self.end_of_multipliers,
@@ -364,6 +365,35 @@ impl ContactStage {
             first: nv,
         });
         Ok(())
+    }
+
+    /// `𝓜⁻¹G_s^T` with the contact wrenches at node s, and the factors of `W = G 𝓜⁻¹ G_s^T`: the impulse acts where the stage ends,
+    /// the velocity is that of the next boundary.
+    fn factor_end_responses(&mut self, tree: &KinematicTree) -> Result<(), StepError> {
+        let Self { del, projection, active, contacts, placements, end, regularisation, .. } = self;
+        let (nv, s, m) = (tree.dof(), del.unknown_nodes(), active.len());
+        let pose = del.body_pose(0, s);
+        let ContactProjection { rows, responses, gram, mean_gram, .. } = projection;
+        for (active, response) in active.iter().zip(responses.chunks_exact_mut(nv)) {
+            let contact = &contacts[active.contact];
+            let placement = &placements[s * contacts.len() + active.contact];
+            let wrench = placement.force_row(contact, active.row);
+            response.fill(0.0);
+            response[..6].copy_from_slice(pose.inverse_transform_wrench(&wrench).to_vector().as_slice());
+            for &dof in &tree.branch(contact.body)[6..] {
+                response[dof as usize] = wrench.dot(&joint_twist(del, dof as usize - 5, s));
+            }
+            end.factor().solve_in_place(response)?;
+        }
+        gram.set_order(m);
+        for (k, row) in rows.chunks_exact(nv).take(m).enumerate() {
+            for (l, response) in responses.chunks_exact(nv).take(m).enumerate() {
+                let sum: f64 = row.iter().zip(response).map(|(a, b)| a * b).sum();
+                let shift = if k == l { *regularisation * *mean_gram } else { 0.0 };
+                gram.entries_mut()[k * m + l] = sum + shift;
+            }
+        }
+        gram.factor().map_err(|(row, pivot)| StepError::RedundantConstraint { row, pivot })
     }
 
     /// Copies the maps.
