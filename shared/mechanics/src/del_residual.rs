@@ -63,6 +63,15 @@ pub(crate) struct DeadLoad {
     pub couple: bool,
 }
 
+/// A torque that keeps its direction in {0} (foot contact). Its gain `τ×η_ω` is not symmetric: it goes with the laws, so the workspace
+/// needs [`ForceCapacity::laws`].
+#[derive(Clone, Debug)]
+pub(crate) struct HeldTorque {
+    pub body: usize,
+    /// N·m at the nodes: one 3-vector per lane group.
+    pub torque_w: Vec<[Quad; 3]>,
+}
+
 /// Wrench of the laws on one body and its gains, at the nodes of one lane group.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct GainLanes {
@@ -115,6 +124,8 @@ pub struct DelWorkspace {
     pub(crate) loads: Vec<DeadLoad>,
     /// Forces of the loads: `[load * groups + g]`.
     pub(crate) load_forces: Vec<[Quad; 3]>,
+    /// Torques of the caller, kept from step to step.
+    pub(crate) held_torques: Vec<HeldTorque>,
     /// `[body * groups + g]`, empty for models without body wrenches and laws.
     pub(crate) gains: Vec<GainLanes>,
     pub(crate) start: State,
@@ -170,6 +181,7 @@ impl DelWorkspace {
             rows: vec![Quad::ZERO; dof],
             loads: Vec::with_capacity(load_capacity),
             load_forces: Vec::with_capacity(load_capacity * groups),
+            held_torques: Vec::new(),
             gains: vec![GainLanes::ZERO; gains],
             start: State::zeros(tree),
             center: RigidTransform::identity(),
@@ -475,6 +487,21 @@ impl DelWorkspace {
                 }
                 add_matrix(&mut gain.eta, &answer.d_pose, lane);
                 add_matrix(&mut gain.nu, &answer.d_velocity, lane);
+            }
+        }
+        for held in &self.held_torques {
+            for (g, [x, y, z]) in held.torque_w.iter().enumerate() {
+                let gain = &mut self.gains[held.body * self.groups + g];
+                for lane in 0..LANES {
+                    let (x, y, z) = (x.0[lane], y.0[lane], z.0[lane]);
+                    for (k, value) in [x, y, z].into_iter().enumerate() {
+                        gain.wrench[k].0[lane] += value;
+                    }
+                    // τ^
+                    for (at, value) in [(1, -z), (2, y), (6, z), (8, -x), (12, -y), (13, x)] {
+                        gain.eta[at].0[lane] += value;
+                    }
+                }
             }
         }
     }

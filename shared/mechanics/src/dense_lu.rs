@@ -29,6 +29,25 @@ impl DenseLu {
         Self { order, entries: vec![0.0; order * order], pivots: vec![0; order] }
     }
 
+    /// Changes the order, up to the one the room was made for without allocation; the entries become zero.
+    pub(crate) fn set_order(&mut self, order: usize) {
+        self.order = order;
+        self.entries.clear();
+        self.entries.resize(order * order, 0.0);
+        self.pivots.clear();
+        self.pivots.resize(order, 0);
+    }
+
+    /// Number of unknowns.
+    pub(crate) fn order(&self) -> usize {
+        self.order
+    }
+
+    /// Rows that the factorisation swapped: row k with `swaps()[k]`, in this order.
+    pub(crate) fn swaps(&self) -> &[usize] {
+        &self.pivots
+    }
+
     /// The entries, row-major: fill them, then [`DenseLu::factor`].
     pub fn entries_mut(&mut self) -> &mut [f64] {
         &mut self.entries

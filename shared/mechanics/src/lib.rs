@@ -16,6 +16,7 @@
 //! | derivatives | [`tangent`], [`kinetic_hessian`], [`gravity_hessian`], [`del_hessian`] | Algorithm T, Algorithms 2 and 3, `H[α,γ]` |
 //! | Newton | [`newton_direction`], [`recursive_newton`], [`branch_lu`], [`dense_lu`], [`step`] | Algorithm B.1 and its rivals; the step |
 //! | use | [`linearize`], [`recursive_linearize`], [`constraints`], [`velocity`] | `A`, `B`; points, loops, welds; velocities from momenta |
+//! | contacts | [`contact_stage`] | the constrained step of a floating robot, solved or lifted |
 //! | horizon | [`stage_batch`] | lifted linearisation of many stages at once, a SIMD lane each |
 //! | classics | [`kinematics`], [`mass_matrix`], [`mass_matrix_factor`], [`inverse_dynamics`], [`energy`] | continuous mechanics |
 //!
@@ -58,6 +59,7 @@ extern crate alloc;
 pub mod branch_lu;
 pub mod broyden;
 pub mod constraints;
+pub mod contact_stage;
 pub mod del_hessian;
 pub mod del_residual;
 pub mod dense_lu;

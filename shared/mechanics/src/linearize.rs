@@ -50,7 +50,8 @@ mod end_rows;
 mod tangent_path;
 
 use end_blocks::EndBlocks;
-use end_rows::{EndRows, SolveMass, fill_right_hand_sides};
+pub(crate) use end_rows::SolveMass;
+use end_rows::{EndRows, fill_right_hand_sides};
 
 /// Mean length of the branches above which the recursion over columns beats the matrix path, for s = 1, 2, 3 and more.
 ///

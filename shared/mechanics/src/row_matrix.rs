@@ -28,6 +28,16 @@ impl RowMatrix {
         Self { rows, columns, stride, first, data }
     }
 
+    /// Another shape in the memory of the first one; no allocation unless it grows. All entries become zero.
+    pub(crate) fn reshape(&mut self, rows: usize, columns: usize) {
+        self.rows = rows;
+        self.columns = columns;
+        self.stride = WIDE * columns.div_ceil(WIDE * LANES);
+        self.data.clear();
+        self.data.resize(rows * self.stride + 1, Quad::ZERO);
+        self.first = self.data.as_ptr().align_offset(CACHE_LINE).min(1);
+    }
+
     /// Number of rows.
     pub fn rows(&self) -> usize {
         self.rows

@@ -162,9 +162,9 @@ pub(super) fn add_products<S: Simd, const N: usize, const W: usize>(
 }
 
 /// Rows of `p` to rows of `q̇`: the branch-sparse factor of the mass matrix on all columns at once.
-pub(super) struct SolveMass<'a> {
-    pub(super) factor: &'a MassMatrixFactor,
-    pub(super) out: &'a mut RowMatrix,
+pub(crate) struct SolveMass<'a> {
+    pub(crate) factor: &'a MassMatrixFactor,
+    pub(crate) out: &'a mut RowMatrix,
 }
 
 impl Kernel for SolveMass<'_> {
