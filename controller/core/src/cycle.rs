@@ -26,7 +26,6 @@ use nalgebra::Vector3;
 
 use crate::balance_trim::BalanceTrim;
 use crate::config::{ControllerConfig, ControllerKind};
-use crate::contact_wrench::{FlatFoot, WrenchCone};
 use crate::errors::ControlError;
 use crate::estimator::{Estimate, Estimator};
 use crate::fallback::{Attempt, FallbackLadder, Situation};
@@ -42,6 +41,7 @@ use crate::stop_watch::StopWatch;
 pub use crate::stop_watch::{Clock, StoppedClock};
 use crate::tasks::TaskTargets;
 use crate::unloaded_leg::UnloadedLeg;
+use delmpc_horizon::foot_cone::{FlatFoot, WrenchCone};
 use delmpc_lq::dual_qp::QpSolver;
 use delmpc_lq::kernels::all_finite;
 use delmpc_lq::lq_problem::LqProblem;

@@ -1,5 +1,6 @@
 //! Why a controller could not be made.
 
+use delmpc_horizon::errors::HorizonError;
 use delmpc_lq::errors::LqError;
 use delmpc_mechanics::errors::{ModelError, StepError};
 
@@ -38,6 +39,9 @@ pub enum ControlError {
     /// The linear-quadratic problem has no solution.
     #[error(transparent)]
     Lq(#[from] LqError),
+    /// Feet, limits or cones are not usable.
+    #[error(transparent)]
+    Horizon(#[from] HorizonError),
     /// The mechanics refused the model.
     #[error(transparent)]
     Mechanics(#[from] ModelError),

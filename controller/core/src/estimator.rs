@@ -225,7 +225,7 @@ impl Estimator {
     }
 }
 
-fn inertial(state: &PlantState) -> Option<Inertial> {
+pub(crate) fn inertial(state: &PlantState) -> Option<Inertial> {
     state.has_sensor(sensor::INERTIAL_UNIT).then(|| Inertial {
         angular_velocity: state.imu_angular_velocity.into(),
         specific_force: state.imu_specific_force.into(),
@@ -235,7 +235,7 @@ fn inertial(state: &PlantState) -> Option<Inertial> {
     })
 }
 
-fn motion_capture(state: &PlantState) -> Option<(RigidTransform, Twist)> {
+pub(crate) fn motion_capture(state: &PlantState) -> Option<(RigidTransform, Twist)> {
     state.has_sensor(sensor::MOTION_CAPTURE).then(|| {
         let [x, y, z, w] = state.base_orientation_w;
         let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));

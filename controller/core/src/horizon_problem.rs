@@ -21,7 +21,7 @@ use faer::{Accum, Mat};
 use nalgebra::Vector3;
 
 use crate::config::ControllerConfig;
-use crate::contact_wrench::{StageWrench, WrenchCone};
+use crate::contact_wrench::StageWrench;
 use crate::errors::ControlError;
 use crate::horizon_dynamics::HorizonDynamics;
 use crate::model::ControllerModel;
@@ -30,6 +30,7 @@ use crate::plan::Plan;
 use crate::reference::Reference;
 use crate::stage_dynamics::StageDynamics;
 use crate::tasks::{MAX_RESIDUALS, TaskTargets, Tasks};
+use delmpc_horizon::foot_cone::WrenchCone;
 use delmpc_lq::dare::{InfiniteHorizon, solve_dare};
 use delmpc_lq::kernels::gemv;
 use delmpc_lq::lq_problem::{BoxBounds, LqProblem, LqSize, LqStage};

@@ -32,6 +32,7 @@ pub mod fallback;
 mod feedback_law;
 pub mod horizon_dynamics;
 mod horizon_problem;
+pub mod legged;
 mod level_stance;
 pub mod model;
 pub mod node_kinematics;

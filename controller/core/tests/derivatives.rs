@@ -5,11 +5,12 @@ mod atlas;
 mod random;
 
 use atlas::atlas;
-use delmpc_controller_core::contact_wrench::{FlatFoot, StageWrench, WrenchCone, mean_wrench};
+use delmpc_controller_core::contact_wrench::{StageWrench, mean_wrench};
 use delmpc_controller_core::model::ControllerModel;
 use delmpc_controller_core::node_kinematics::NodeKinematics;
 use delmpc_controller_core::stage_dynamics::StageDynamics;
 use delmpc_controller_core::tasks::{MAX_RESIDUALS, TaskTargets, TaskWeights, Tasks};
+use delmpc_horizon::foot_cone::{FlatFoot, WrenchCone};
 use delmpc_lq::lq_problem::{LqProblem, LqSize};
 use delmpc_lq::lq_stage::Residuals;
 use nalgebra::Vector3;

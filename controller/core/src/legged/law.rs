@@ -1,0 +1,168 @@
+//! The law a command carries: the plan's torques and joints, the joint part of the first gain, damping where there is no plan.
+
+use delmpc_messages::{Command, FallbackLevel, LARGEST_EFFORT, PlantState, StateEstimate};
+use nalgebra::{Rotation3, UnitQuaternion};
+
+use super::LeggedController;
+use crate::config::ControllerKind;
+use crate::feedback_law::{LawSegment, write_law};
+
+/// Part of effort over velocity limit that damps a joint on the last levels.
+const DAMPING_FRACTION: f64 = 0.1;
+
+impl LeggedController {
+    /// Forms the law of a level and writes it out; a law with a number that is not plausible gives way to one without torque.
+    pub(super) fn write_command(&mut self, level: FallbackLevel, state: &PlantState, now_ns: u64) {
+        let start_ns = match self.last_state_ns {
+            Some(last) => now_ns.max(last.saturating_add(nanoseconds(self.config.delay_s))),
+            None => now_ns,
+        };
+        let command = &mut self.command;
+        command.state_sequence = self.last_sequence.max(u64::from(self.last_state_ns.is_some()));
+        command.state_time_ns = self.last_state_ns.unwrap_or(state.time_ns);
+        command.valid_from_ns = start_ns;
+        command.valid_until_ns = start_ns.saturating_add(nanoseconds(self.config.command_life_s));
+        self.tell_estimate();
+        let joints = self.robot.model.tree.joint_count();
+        for level in [level, FallbackLevel::DampingOnly, FallbackLevel::ZeroTorque] {
+            self.form_law(level, self.run_time_s(start_ns));
+            self.command.fallback_level = level as u32;
+            let Self { law, command, .. } = self;
+            write(law, command);
+            if command.validate(self.robot.joint_set_hash, joints).is_ok() {
+                if level > self.ladder.level() {
+                    self.ladder.descend_to(level);
+                }
+                return;
+            }
+        }
+    }
+
+    fn tell_estimate(&mut self) {
+        let base = self.sensing.base();
+        let rotation = Rotation3::from_matrix_unchecked(base.base_link_pose_w.rotation);
+        self.command.estimate = StateEstimate {
+            known: u32::from(self.last_state_ns.is_some()),
+            feet_loaded: (self.sensing.feet().iter().enumerate())
+                .map(|(k, foot)| u32::from(foot.loaded) << k)
+                .sum(),
+            base_orientation_w: UnitQuaternion::from_rotation_matrix(&rotation).coords.into(),
+            base_angular_velocity_b: base.base_twist_b.angular.into(),
+            base_linear_velocity_b: base.base_twist_b.linear.into(),
+            gyro_bias: base.gyro_bias.into(),
+            accelerometer_bias: base.accelerometer_bias.into(),
+        };
+    }
+
+    fn form_law(&mut self, level: FallbackLevel, time_s: f64) {
+        let follows = matches!(level, FallbackLevel::FreshSolution | FallbackLevel::ShiftedPlan);
+        match (self.config.kind, follows && self.has_plan) {
+            (ControllerKind::Off, _) => self.form_passive_law(FallbackLevel::ZeroTorque),
+            (_, true) => self.form_law_of_plan(time_s),
+            (_, false) => self.form_passive_law(level),
+        }
+        for segment in self.law.segments_mut() {
+            for (j, limit) in self.robot.model.limits.iter().enumerate() {
+                let effort = limit.effort.min(LARGEST_EFFORT);
+                (segment.lower[j], segment.upper[j]) = (-effort, effort);
+            }
+        }
+        self.law.segments_mut().iter_mut().for_each(LawSegment::clamp);
+    }
+
+    /// The stages of the plan from a time on, for as long as a command lives.
+    fn form_law_of_plan(&mut self, time_s: f64) {
+        let Self { law, plan, scratch, .. } = self;
+        let joints = scratch.q.len();
+        let end_s = time_s + self.config.command_life_s;
+        let (first, stages) = (plan.stage_at(time_s), plan.stages());
+        let mut from_s = time_s;
+        for stage in first..stages {
+            if stage > first && from_s >= end_s {
+                break;
+            }
+            let mut until_s = plan.times[stage + 1];
+            if stage + 1 == stages {
+                until_s = until_s.max(from_s + self.config.period_s);
+            }
+            let length_s = until_s - from_s;
+            if length_s < 1e-6 {
+                continue;
+            }
+            let segment = match from_s == time_s {
+                true => Some(law.restart()),
+                false => law.append(from_s - time_s),
+            };
+            let Some(segment) = segment else { break };
+            segment.torque.copy_from_slice(plan.input(stage));
+            plan.state_at(until_s, scratch);
+            segment.acceleration.copy_from_slice(&scratch.rate);
+            plan.state_at(from_s, scratch);
+            segment.reference[..joints].copy_from_slice(&scratch.q);
+            segment.reference[joints..].copy_from_slice(&scratch.rate);
+            for j in 0..joints {
+                segment.acceleration[j] = (segment.acceleration[j] - scratch.rate[j]) / length_s;
+            }
+            from_s = until_s;
+        }
+        let gain = self.riccati.gain(first);
+        let nv = 6 + joints;
+        for i in 0..joints {
+            for j in 0..joints {
+                law.gain[(i, j)] = gain[(i, 6 + j)];
+                law.gain[(i, joints + j)] = gain[(i, nv + 6 + j)];
+            }
+        }
+        self.allow_for_means();
+    }
+
+    /// The servo's velocities are means over its last samples: in a motion they are behind the reference by half of their time.
+    fn allow_for_means(&mut self) {
+        let samples = self.command.rate_samples.saturating_sub(1);
+        let lag_s = 0.5 * f64::from(samples) * self.config.servo_period_s;
+        let (segments, gain) = self.law.segments_and_gain();
+        for segment in segments {
+            let joints = segment.torque.len();
+            for i in 0..joints {
+                let missing: f64 =
+                    (0..joints).map(|j| gain[(i, joints + j)] * lag_s * segment.acceleration[j]).sum();
+                segment.torque[i] += missing;
+            }
+        }
+    }
+
+    /// The torque that carries the aim, with damping; damping; nothing.
+    fn form_passive_law(&mut self, level: FallbackLevel) {
+        let Self { law, reference, robot, measured, .. } = self;
+        let joints = measured.q.len();
+        let segment = law.restart();
+        segment.torque.fill(0.0);
+        segment.reference.fill(0.0);
+        segment.reference[..joints].copy_from_slice(&measured.q);
+        if level < FallbackLevel::DampingOnly {
+            segment.torque.copy_from_slice(&reference.target(0).torque);
+        }
+        law.gain.fill(0.0);
+        if level != FallbackLevel::ZeroTorque {
+            for (j, limit) in robot.model.limits.iter().enumerate() {
+                let damping = DAMPING_FRACTION * limit.effort / limit.velocity;
+                law.gain[(j, joints + j)] = if damping.is_finite() { -damping } else { -1.0 };
+            }
+        }
+    }
+}
+
+/// The joints of a floating tree are in the order of the messages.
+fn write(law: &crate::feedback_law::Law, command: &mut Command) {
+    let mut order = [0; delmpc_messages::MAX_JOINTS];
+    let joints = law.first().torque.len();
+    for (j, joint) in order.iter_mut().enumerate() {
+        *joint = j;
+    }
+    write_law(law, &order[..joints], command);
+    command.imu_gain = Default::default();
+}
+
+fn nanoseconds(seconds: f64) -> u64 {
+    libm::round(seconds * 1e9) as u64
+}
