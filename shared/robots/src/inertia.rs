@@ -15,6 +15,15 @@ pub(crate) fn check(inertia: &LinkInertia) -> Result<(), ModelError> {
     }
 }
 
+/// Model files have as few as three digits: a plate may break the triangle inequality by this part of its largest moment.
+const ROUND_OFF: f64 = 5e-3;
+
+/// Whether the triangle inequality is broken by no more than the digits of a model file.
+pub(crate) fn is_round_off(inertia: &LinkInertia) -> bool {
+    let Err(ModelError::InertiaTriangle { excess, .. }) = check(inertia) else { return false };
+    excess <= ROUND_OFF * inertia.inertia.symmetric_eigenvalues().amax()
+}
+
 /// The nearest inertia that a body can have, keeping mass, mass centre and principal axes.
 pub(crate) fn repair(inertia: &LinkInertia) -> LinkInertia {
     let symmetric = (inertia.inertia + inertia.inertia.transpose()) * 0.5;
