@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use delmpc_controller_core::config::ControllerConfig;
 use delmpc_mechanics::prelude::RigidTransform;
 use delmpc_messages::{JointSetHasher, MAX_JOINTS, joint_set_hash};
-use delmpc_robots::{RobotModel, load};
+use delmpc_robots::{ImpossibleInertia, LoadOptions, RobotModel, load_with};
 use delmpc_scenario::{Document, Scenario};
 
 use crate::start::Start;
@@ -44,7 +44,7 @@ impl Setup {
         }
         let scenario = document.scenario().map_err(Failure::input)?;
         let urdf = find_robot(file, &scenario.robot.urdf);
-        let robot = load(&urdf).map_err(Failure::input)?;
+        let robot = load_with(&urdf, &load_options(&scenario)).map_err(Failure::input)?;
         let notes = document.notes().to_vec();
         let mut setup = Self { scenario, robot, urdf, notes };
         let refused = |error: String| Failure::Input(format!("{}: {error}", file.display()));
@@ -223,6 +223,15 @@ pub fn scenario_file_or(named: Option<&Path>, usual: &str) -> Result<PathBuf, Fa
         let advice = "run it in the project's folder, or name a scenario: delmpc run FILE";
         Failure::Input(format!("{usual} is neither here nor above the program: {advice}"))
     })
+}
+
+/// How a scenario wants its robot read.
+pub(crate) fn load_options(scenario: &Scenario) -> LoadOptions {
+    let impossible_inertia = match scenario.robot.accept_impossible_inertia {
+        true => ImpossibleInertia::Accept,
+        false => ImpossibleInertia::Refuse,
+    };
+    LoadOptions { impossible_inertia, ..LoadOptions::default() }
 }
 
 /// The robot file: relative to the scenario, or else to the working folder.

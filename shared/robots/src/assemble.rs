@@ -151,6 +151,9 @@ impl Assembly<'_> {
         });
         self.place(start, 0, RigidTransform::identity())?;
         let masses = description.subtree_masses();
+        let inertial = description.subtrees_with_inertial();
+        let accept = self.options.impossible_inertia == ImpossibleInertia::Accept;
+        let mut held = Vec::new();
         let mut open: Vec<usize> = description.children[start].iter().rev().copied().collect();
         while let Some(index) = open.pop() {
             let joint = &description.joints[index];
@@ -158,14 +161,19 @@ impl Assembly<'_> {
             let placement = pose * joint.origin;
             match joint.kind {
                 JointType::Fixed => self.place(joint.child, group, placement)?,
+                // Nothing can be computed of it, and nothing is lost: a frame that was given a joint, or a joint that by its file cannot move.
                 _ if masses[joint.child] == 0.0
-                    && self.options.impossible_inertia == ImpossibleInertia::Accept =>
+                    && (accept || !inertial[joint.child] || joint.limits.velocity == 0.0) =>
                 {
-                    let place = format!("{}:{}", self.file.display(), joint.line);
-                    self.warnings.push(format!(
-                        "{place}: joint `{}`: it carries no mass: it is held at 0",
-                        joint.name
-                    ));
+                    let error = match inertial[joint.child] {
+                        true => self
+                            .refuse_link(joint.child, Rule::Physics(ModelError::MasslessSubtree { body: 0 })),
+                        false => self.refuse_link(joint.child, Rule::MissingInertial),
+                    };
+                    if self.options.strict {
+                        return Err(error);
+                    }
+                    held.push((error, joint.name.as_str()));
                     self.place(joint.child, group, placement)?;
                 }
                 _ => {
@@ -174,6 +182,9 @@ impl Assembly<'_> {
                 }
             }
             open.extend(description.children[joint.child].iter().rev());
+        }
+        for (error, joint) in held {
+            self.warnings.push(format!("{}: its joint `{joint}` is held at 0", error.fault()));
         }
         let mut massless = Vec::new();
         for group in &self.groups[1..] {
@@ -494,7 +505,8 @@ impl Group {
             return LinkInertia::new(0.0, Vector3::zeros(), (inertia + inertia.transpose()) * 0.5);
         }
         let (com, inertia) = self.inertia.to_central();
-        LinkInertia::new(self.inertia.mass, com, (inertia + inertia.transpose()) * 0.5)
+        let symmetric = (inertia + inertia.transpose()) * 0.5;
+        inertia::without_round_off(LinkInertia::new(self.inertia.mass, com, symmetric))
     }
 }
 

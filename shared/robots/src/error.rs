@@ -202,7 +202,7 @@ impl Rule {
                 "give a value that is not negative"
             }
             Self::Physics(_) => {
-                "correct the inertia (about the mass centre, kg m^2), or have it accepted: accept_impossible_inertia = true in the companion table, --accept-impossible-inertia of `delmpc model`"
+                "correct the inertia (about the mass centre, kg m^2), or have it accepted: accept_impossible_inertia = true in the companion table, or --set robot.accept_impossible_inertia=true for one run"
             }
             Self::UnsupportedJoint { .. } => {
                 "use revolute, continuous, prismatic, planar or fixed joints; a floating joint only from an empty root link"

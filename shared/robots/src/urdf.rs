@@ -13,6 +13,7 @@ use urdf_rs::JointType;
 use crate::document::{Document, Warning, without_dashes};
 use crate::error::{RobotError, Rule, Subject, shorten};
 use crate::facts::{Facts, LinkFacts};
+use crate::inertia::without_round_off;
 use crate::model::{Geometry, JointLimits, ShapeRole};
 
 /// A robot as its URDF describes it; the joints form a tree rooted at `root`.
@@ -91,8 +92,18 @@ impl Joint {
 impl Description {
     /// Mass of every link and of all it carries.
     pub(crate) fn subtree_masses(&self) -> Vec<f64> {
-        let mut masses: Vec<f64> =
-            self.links.iter().map(|link| link.inertia.map_or(0.0, |inertia| inertia.mass)).collect();
+        let of_link = |link: &Link| link.inertia.map_or(0.0, |inertia| inertia.mass);
+        self.over_subtrees(self.links.iter().map(of_link).collect(), |sum, carried| sum + carried)
+    }
+
+    /// Whether a link or one that it carries has `<inertial>`.
+    pub(crate) fn subtrees_with_inertial(&self) -> Vec<bool> {
+        let of_link = |link: &Link| link.inertia.is_some();
+        self.over_subtrees(self.links.iter().map(of_link).collect(), |here, carried| here || carried)
+    }
+
+    /// Values of links joined with those of all they carry, from the leaves to the root.
+    fn over_subtrees<T: Copy>(&self, mut values: Vec<T>, join: impl Fn(T, T) -> T) -> Vec<T> {
         let mut order = vec![self.root];
         let mut next = 0;
         while let Some(&link) = order.get(next) {
@@ -100,11 +111,11 @@ impl Description {
             next += 1;
         }
         for &link in order.iter().rev() {
-            let carried: f64 =
-                self.children[link].iter().map(|&joint| masses[self.joints[joint].child]).sum();
-            masses[link] += carried;
+            for &joint in &self.children[link] {
+                values[link] = join(values[link], values[self.joints[joint].child]);
+            }
         }
-        masses
+        values
     }
 
     pub(crate) fn read(file: &Path, text: &str) -> Result<Self, RobotError> {
@@ -173,15 +184,14 @@ fn describe(
                 .ok_or_else(|| refuse(Rule::Unknown { kind: "link", name: shorten(name) }))
         };
         let (parent, child) = (find_link(&joint.parent.link)?, find_link(&joint.child.link)?);
-        let mimic = match &joint.mimic {
-            None => None,
-            Some(mimic) => {
-                let followed = joint_index.get(mimic.joint.as_str()).copied();
-                let followed = followed
-                    .ok_or_else(|| refuse(Rule::Unknown { kind: "joint", name: shorten(&mimic.joint) }))?;
-                Some((followed, mimic.multiplier.unwrap_or(1.0), mimic.offset.unwrap_or(0.0)))
-            }
-        };
+        let mimic = joint.mimic.as_ref().and_then(|mimic| {
+            let Some(&followed) = joint_index.get(mimic.joint.as_str()) else {
+                let unknown = refuse(Rule::Unknown { kind: "joint", name: shorten(&mimic.joint) });
+                document.warn(unknown, "it moves by itself");
+                return None;
+            };
+            Some((followed, mimic.multiplier.unwrap_or(1.0), mimic.offset.unwrap_or(0.0)))
+        });
         if let Some(first) = carried_by[child] {
             let rule =
                 Rule::TwoParents { first: facts.joints[first].name.clone(), second: fact.name.clone() };
@@ -287,7 +297,7 @@ fn link_inertia(inertial: &urdf_rs::Inertial, rotation: Option<Matrix3<f64>>) ->
         let turned = origin.rotation * given * origin.rotation.transpose();
         (turned + turned.transpose()) * 0.5
     };
-    LinkInertia::new(inertial.mass.value, origin.translation, inertia)
+    without_round_off(LinkInertia::new(inertial.mass.value, origin.translation, inertia))
 }
 
 fn primitive(geometry: &urdf_rs::Geometry) -> Option<Geometry> {

@@ -1,5 +1,7 @@
 //! What the field writes beside the format: read with a warning that names file, line, element and what is done; `strict` makes it an error.
+#![allow(clippy::panic, clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+use delmpc_mechanics::errors::ModelError;
 use delmpc_robots::{
     BaseChoice, ImpossibleInertia, LoadOptions, RobotError, RobotModel, Rule, Subject, load_str,
 };
@@ -199,25 +201,41 @@ fn links_that_move_without_mass() {
     };
     let model = warned(&fish(BODY, "", LIMIT, &tip(BODY)), 3, &["link `tail`", "no <inertial>"]);
     assert_eq!(model.joint_names, ["hinge", "k"]);
-    // At the end of the tree: refused, or held.
-    for (tip, rule) in [
-        (tip(""), Rule::MissingInertial),
-        (
-            tip(&impossible(0.0, 1e-3)),
-            Rule::Physics(delmpc_mechanics::errors::ModelError::InertiaWithoutMass { body: 0 }),
-        ),
+    // At the end of the tree nothing can move it: a frame that somebody gave a joint is held, and nothing else is guessed.
+    let model =
+        warned(&fish(BODY, BODY, LIMIT, &tip("")), 5, &["link `tip`", "no <inertial>", "`k` is held at 0"]);
+    assert_eq!(model.joint_names, ["hinge"]);
+    let still = tip(&impossible(0.0, 0.0)).replace("velocity='6'", "velocity='0'");
+    let model = warned(&fish(BODY, BODY, LIMIT, &still), 5, &["link `tip`", "has mass", "`k` is held at 0"]);
+    assert_eq!(model.joint_names, ["hinge"]);
+    for (inertial, rule) in [
+        (impossible(0.0, 0.0), ModelError::MasslessSubtree { body: 0 }),
+        (impossible(0.0, 1e-3), ModelError::InertiaWithoutMass { body: 0 }),
     ] {
-        let urdf = fish(BODY, BODY, LIMIT, &tip);
+        let urdf = fish(BODY, BODY, LIMIT, &tip(&inertial));
         let error = load(&urdf, &LoadOptions::default()).unwrap_err();
         assert_eq!(error.subject(), &Subject::Link("tip".to_owned()));
-        assert_eq!(std::mem::discriminant(error.rule()), std::mem::discriminant(&rule), "{error}");
+        let Rule::Physics(found) = error.rule() else { panic!("{error}") };
+        assert_eq!(std::mem::discriminant(found), std::mem::discriminant(&rule), "{error}");
         let accept = LoadOptions { impossible_inertia: ImpossibleInertia::Accept, ..LoadOptions::default() };
         let model = load(&urdf, &accept).unwrap();
         assert_eq!(model.joint_names, ["hinge"]);
-        assert!(
-            model.warnings.iter().any(|warning| warning.contains("joint `k`") && warning.contains("held"))
-        );
+        assert!(model.warnings.iter().any(|warning| warning.contains("`k` is held at 0")));
     }
+}
+
+#[test]
+fn a_joint_that_follows_nobody_moves_by_itself() {
+    let urdf = fish(BODY, BODY, &format!("<mimic joint='hing'/>{LIMIT}"), "");
+    let model = warned(&urdf, 4, &["joint `hinge`", "the joint `hing`", "by itself"]);
+    assert!(model.coordinate_map.is_identity() && model.actuated[0]);
+}
+
+#[test]
+fn round_off_around_zero_is_zero() {
+    let point = BODY.replace("'0.1'", "'-5.4e-20'");
+    let model = load(&fish(BODY, &point, LIMIT, ""), &LoadOptions::default()).unwrap();
+    assert_eq!(model.tree.bodies()[1].inertia.inertia, nalgebra::Matrix3::zeros());
 }
 
 #[test]
