@@ -50,7 +50,7 @@ use toml::Spanned;
 
 use crate::document::line_of;
 use crate::error::{RobotError, Rule, Subject, shorten};
-use crate::model::{Attachment, ContactPoint, NamedFrame, Posture, RobotModel, Sole};
+use crate::model::{Attachment, ContactPoint, JointLimits, NamedFrame, Posture, RobotModel, Sole};
 use crate::urdf::Description;
 
 #[derive(Deserialize)]
@@ -332,15 +332,17 @@ impl CompanionFile {
                 if !value.is_finite() {
                     return refuse(Rule::BadNumber { key: "a joint coordinate" });
                 }
-                let limits = &model.limits[joint];
-                if value < limits.lower || value > limits.upper {
-                    let name = shorten(name);
-                    model.warnings.push(format!(
-                        "{entry}: joint `{name}` at {value} is outside its limits {} to {}",
-                        limits.lower, limits.upper
-                    ));
-                }
                 q[joint] = value;
+            }
+            // Those that are not named too, which are at 0.
+            for ((name, limits), value) in model.joint_names.iter().zip(&model.limits).zip(&q) {
+                if *value < limits.lower || *value > limits.upper {
+                    let (name, JointLimits { lower, upper, .. }) = (shorten(name), limits);
+                    let warning = format!(
+                        "{entry}: joint `{name}` at {value} is outside its limits {lower} to {upper}"
+                    );
+                    model.warnings.push(warning);
+                }
             }
             model.postures.push(Posture {
                 name: table.name.clone(),
