@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
 
+use crate::check::CheckArguments;
 use crate::completions::CompletionsArguments;
 use crate::model::ModelArguments;
 use crate::plan::PlanArguments;
@@ -107,6 +108,12 @@ Examples:
   echo '{\"q\": {\"r_leg_kny\": 0.9}, \"dt\": 0.005}' > at.json
   delmpc model configs/robots/atlas.urdf --at at.json       A, B, mass matrix, step as JSON";
 
+const CHECK_EXAMPLES: &str = "\
+Examples:
+  delmpc check configs/scenarios/*.toml
+  delmpc check my_robot/stand.toml --set sensors.delay_s=0.01
+  delmpc check my_robot/robot.urdf --strict";
+
 const TIMING_EXAMPLES: &str = "\
 Examples:
   delmpc timing                                       60 s alone and 60 s under co-load, plant on core 0, controller on core 1
@@ -163,6 +170,12 @@ pub enum Command {
     /// postures, and what was accepted but should be known.
     #[command(after_long_help = MODEL_EXAMPLES)]
     Model(ModelArguments),
+    /// Check scenarios, robots and companion tables: everything that `run` would refuse, all at once
+    ///
+    /// Keys alone and against each other, the robot, names that it must know, posture, torques, controller and plant. Exit status 2 when
+    /// there is an error.
+    #[command(after_long_help = CHECK_EXAMPLES)]
+    Check(CheckArguments),
     /// Find the largest push survived in every direction: table, JSON, polar plot
     ///
     /// The robot stands in the scenario's posture and is pushed once, in lockstep; the impulse is found by bisection. Left behind are

@@ -1,6 +1,6 @@
 //! The command `delmpc`: its parts as a library, so that tests can use them without a terminal.
 //!
-//! One file per subcommand ([`run`], [`plant`], [`controller`], [`model`], [`replay`], [`push_map`],
+//! One file per subcommand ([`run`], [`plant`], [`controller`], [`model`], [`mod@check`], [`replay`], [`push_map`],
 //! [`mod@report`]); what they share:
 //!
 //! | file | what it does |
@@ -21,6 +21,7 @@
 //! | [`summary`], [`summary_table`] | all figures and success; the same as a person reads them |
 //! | [`colour`] | colours on a terminal |
 //! | [`stance`] | how a robot stands in its postures, for the table of `delmpc model` |
+//! | [`check`] | everything that a run would refuse, all at once |
 //! | [`drawing`] | a robot in its postures as SVG |
 //! | [`completions`] | what a shell needs to complete our words |
 //! | [`log`], [`log_viewer`] | the log of states, commands and truth, and what shows the robot to viewers of logs |
@@ -33,6 +34,7 @@
 //! | [`mod@plan`] | a motion planned through contact, or a plan file checked |
 //! | [`status_line`] | one line about the running run |
 
+pub mod check;
 pub mod cli;
 pub mod colour;
 pub mod completions;

@@ -37,9 +37,12 @@ pub struct ModelArguments {
     /// State and step as JSON; the answer is one JSON object
     #[arg(long, value_name = "FILE.json")]
     pub at: Option<PathBuf>,
-    /// Take inertias that break the triangle inequality as they are, with a warning
+    /// Take inertias that no body has as they are and hold joints that carry no mass, with a warning; the same key is in the companion table
     #[arg(long)]
     pub accept_impossible_inertia: bool,
+    /// Refuse what is read with a warning: decoration that cannot be read, values that are missing
+    #[arg(long)]
+    pub strict: bool,
     /// Draw the robot in its postures
     #[arg(long, value_name = "FILE.svg", conflicts_with = "at")]
     pub svg: Option<PathBuf>,
@@ -212,7 +215,7 @@ fn load_robot(
     gravity: Option<[f64; 3]>,
 ) -> Result<RobotModel, Failure> {
     let urdf = arguments.urdf.as_path();
-    let mut options = LoadOptions::default();
+    let mut options = LoadOptions { strict: arguments.strict, ..LoadOptions::default() };
     if arguments.accept_impossible_inertia {
         options.impossible_inertia = ImpossibleInertia::Accept;
     }

@@ -12,7 +12,7 @@ use delmpc_planner::planner::{Planned, Search, plan as search_plan};
 use delmpc_planner::robot::PlanRobot;
 use delmpc_planner::task::{BaseBounds, ExecutionLimits, PlanWeights, Standing, Task};
 use delmpc_planner::terrain::{Gap, Obstacle, Step, Terrain};
-use delmpc_robots::load;
+use delmpc_robots::{load, load_with};
 use delmpc_scenario::{Document, PlanSettings, PlanWeightSettings, Scenario};
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -140,7 +140,8 @@ fn task_of(
     settings: &PlanSettings,
 ) -> Result<Task, delmpc_planner::error::PlanError> {
     let urdf = crate::setup::find_robot(file, &scenario.robot.urdf);
-    let model = load(&urdf).map_err(|error| delmpc_planner::error::PlanError::PlanFile {
+    let options = crate::setup::load_options(scenario);
+    let model = load_with(&urdf, &options).map_err(|error| delmpc_planner::error::PlanError::PlanFile {
         file: urdf.display().to_string(),
         what: error.to_string(),
     })?;

@@ -5,9 +5,10 @@ use std::path::{Path, PathBuf};
 use delmpc_controller_core::config::ControllerConfig;
 use delmpc_mechanics::prelude::RigidTransform;
 use delmpc_messages::{JointSetHasher, MAX_JOINTS, joint_set_hash};
-use delmpc_robots::{RobotModel, load};
+use delmpc_robots::{ImpossibleInertia, LoadOptions, RobotModel, load_with};
 use delmpc_scenario::{Document, Scenario};
 
+use crate::check::Findings;
 use crate::start::Start;
 use crate::verdict::Failure;
 
@@ -36,22 +37,50 @@ impl Setup {
     /// Reads a scenario, applies overrides and loads its robot.
     ///
     /// # Errors
-    /// [`Failure::Input`] with file, key and remedy.
+    /// [`Failure::Input`] with everything that is wrong: file, key and remedy, a line each.
     pub fn read(file: &Path, overrides: &[String]) -> Result<Self, Failure> {
-        let mut document = Document::read(file).map_err(Failure::input)?;
+        let (setup, findings) = Self::inspect(file, overrides)?;
+        findings.refuse()?;
+        let mut setup = setup.ok_or_else(|| Failure::Input(format!("{}: no robot", file.display())))?;
+        setup.notes.extend(findings.warnings);
+        Ok(setup)
+    }
+
+    /// Reads a scenario and its robot as far as they can be read, and everything that is wrong with them, alone and together.
+    ///
+    /// # Errors
+    /// [`Failure::Input`] when the scenario cannot be read at all, or an override names nothing.
+    pub fn inspect(file: &Path, overrides: &[String]) -> Result<(Option<Self>, Findings), Failure> {
+        let mut document = Document::lenient(file).map_err(Failure::input)?;
         for change in overrides {
             document.set(change).map_err(Failure::input)?;
         }
-        let scenario = document.scenario().map_err(Failure::input)?;
+        let mut findings = Findings::default();
+        findings.errors.extend(document.faults().iter().map(ToString::to_string));
+        let scenario = match document.unchecked() {
+            Ok(scenario) if !scenario.robot.urdf.is_empty() => scenario,
+            _ => return Ok((None, findings)),
+        };
         let urdf = find_robot(file, &scenario.robot.urdf);
-        let robot = load(&urdf).map_err(Failure::input)?;
-        let notes = document.notes().to_vec();
-        let mut setup = Self { scenario, robot, urdf, notes };
-        let refused = |error: String| Failure::Input(format!("{}: {error}", file.display()));
-        setup.check_names().map_err(refused)?;
-        let warnings = crate::stance::check_scenario(&setup).map_err(refused)?;
-        setup.notes.extend(warnings);
-        Ok(setup)
+        let mut robot = match load_with(&urdf, &load_options(&scenario)) {
+            Ok(robot) => robot,
+            Err(error) => {
+                findings.errors.push(error.to_string());
+                return Ok((None, findings));
+            }
+        };
+        findings.warnings.extend(robot.warnings.iter().cloned());
+        let clamped = crate::check::clamp_efforts(&mut robot);
+        findings.warnings.extend(clamped.into_iter().map(|warning| format!("{}: {warning}", urdf.display())));
+        let setup = Self { scenario, robot, urdf, notes: document.notes().to_vec() };
+        let of_file = |fault: String| format!("{}: {fault}", file.display());
+        let mut wrong = setup.check_names();
+        match crate::stance::check_scenario(&setup) {
+            Ok(warnings) => findings.warnings.extend(warnings),
+            Err(fault) => wrong.push(fault),
+        }
+        findings.errors.extend(wrong.into_iter().map(of_file));
+        Ok((Some(setup), findings))
     }
 
     /// The hash by which processes recognise that they have the same joints.
@@ -144,56 +173,59 @@ impl Setup {
         ))
     }
 
-    /// Every name of the scenario that the robot must know.
-    fn check_names(&self) -> Result<(), String> {
+    /// What keeps this robot from being run like this: its joints, and every name of the scenario that it must know.
+    fn check_names(&self) -> Vec<String> {
         let Self { scenario, robot, .. } = self;
+        let mut wrong = Vec::new();
         if !robot.tree.is_floating() {
-            return Err(
-                "`robot.urdf`: this robot is fixed to the world; a plant needs one that can fall".to_owned()
+            wrong.push(
+                "`robot.urdf`: this robot is fixed to the world; a plant needs one that can fall".to_owned(),
             );
         }
-        self.check_stages()?;
+        wrong.extend(self.check_stages().err());
         let joints = robot.joint_names.len();
         if joints > MAX_JOINTS {
-            return Err(format!("`robot.urdf`: {joints} joints, but a message has room for {MAX_JOINTS}"));
+            wrong.push(format!(
+                "`robot.urdf`: {joints} joints, but a message has room for {MAX_JOINTS}: lock the others in the companion table, \
+                 [locked] NAME = 0.0"
+            ));
         }
-        if let Some(why) = crate::stance::undriven(robot).into_iter().next() {
-            return Err(format!("`robot.urdf`: {why}"));
-        }
+        wrong.extend(crate::stance::undriven(robot).into_iter().map(|why| format!("`robot.urdf`: {why}")));
         for (limit, joint) in robot.limits.iter().zip(&robot.joint_names) {
             if limit.lower >= limit.upper {
-                return Err(format!(
-                    "`robot.urdf`: the joint {joint} has no range ({} .. {}): make its type \"fixed\" where it is locked",
-                    limit.lower, limit.upper
-                ));
-            }
-            if limit.velocity <= 0.0 {
-                let velocity = limit.velocity;
-                return Err(format!(
-                    "`robot.urdf`: the joint {joint} has the velocity limit {velocity}: it has to be above 0, or not given"
+                wrong.push(format!(
+                    "`robot.urdf`: the joint {joint} has no range ({} .. {}): make its type \"fixed\", or lock it in the companion \
+                     table, [locked] {joint} = {:?}",
+                    limit.lower, limit.upper, limit.lower
                 ));
             }
         }
-        let soles = robot.soles.iter().map(|sole| sole.name.as_str());
-        one_of("robot.stance", "sole", &scenario.robot.stance, soles)?;
-        let postures = robot.postures.iter().map(|posture| posture.name.as_str());
-        one_of("robot.posture", "posture", &scenario.robot.posture, postures)?;
-        let links = || robot.links.iter().map(|link| link.name.as_str());
+        let mut one_of = |key: &str, kind: &str, name: &str, known: Vec<&str>| {
+            if !known.contains(&name) {
+                let known = known.join(", ");
+                wrong.push(format!("`{key}` = \"{name}\": the robot has no such {kind}; it has {known}"));
+            }
+        };
+        let soles = robot.soles.iter().map(|sole| sole.name.as_str()).collect();
+        one_of("robot.stance", "sole", &scenario.robot.stance, soles);
+        let postures = robot.postures.iter().map(|posture| posture.name.as_str()).collect();
+        one_of("robot.posture", "posture", &scenario.robot.posture, postures);
+        let links: Vec<&str> = robot.links.iter().map(|link| link.name.as_str()).collect();
         if let Some(reach) = &scenario.reach {
             let frames = robot.frames.iter().map(|frame| frame.name.as_str());
-            one_of("reach.hand", "frame or link", &reach.hand, frames.chain(links()))?;
+            one_of("reach.hand", "frame or link", &reach.hand, frames.chain(links.iter().copied()).collect());
         }
         if !scenario.sensors.imu_link.is_empty() {
-            one_of("sensors.imu_link", "link", &scenario.sensors.imu_link, links())?;
+            one_of("sensors.imu_link", "link", &scenario.sensors.imu_link, links.clone());
         }
         for joint in scenario.robot.start.joint_offset.keys() {
-            let known = robot.joint_names.iter().map(String::as_str);
-            one_of("robot.start.joint_offset", "joint", joint, known)?;
+            let known = robot.joint_names.iter().map(String::as_str).collect();
+            one_of("robot.start.joint_offset", "joint", joint, known);
         }
         for push in &scenario.push {
-            one_of("push.link", "link", &push.link, links())?;
+            one_of("push.link", "link", &push.link, links.clone());
         }
-        Ok(())
+        wrong
     }
 }
 
@@ -225,17 +257,18 @@ pub fn scenario_file_or(named: Option<&Path>, usual: &str) -> Result<PathBuf, Fa
     })
 }
 
+/// How a scenario wants its robot read.
+pub(crate) fn load_options(scenario: &Scenario) -> LoadOptions {
+    let impossible_inertia = match scenario.robot.accept_impossible_inertia {
+        true => ImpossibleInertia::Accept,
+        false => ImpossibleInertia::Refuse,
+    };
+    LoadOptions { impossible_inertia, ..LoadOptions::default() }
+}
+
 /// The robot file: relative to the scenario, or else to the working folder.
 pub(crate) fn find_robot(scenario: &Path, urdf: &str) -> PathBuf {
     let beside = scenario.parent().unwrap_or(Path::new("")).join(urdf);
     let here = PathBuf::from(urdf);
     if !beside.is_file() && here.is_file() { here } else { beside }
-}
-
-fn one_of<'a>(key: &str, kind: &str, name: &str, known: impl Iterator<Item = &'a str>) -> Result<(), String> {
-    let known: Vec<&str> = known.collect();
-    if known.contains(&name) {
-        return Ok(());
-    }
-    Err(format!("`{key}` = \"{name}\": the robot has no such {kind}; it has {}", known.join(", ")))
 }

@@ -144,13 +144,6 @@ pub fn check_scenario(setup: &Setup) -> Result<Vec<String>, String> {
         }
         warnings.extend(holding(robot, posture, stance.sole).map_err(in_words)?.warning);
     }
-    let limits = robot.joint_names.iter().zip(&robot.limits).zip(&posture.q);
-    for ((name, limit), q) in limits.filter(|((_, limit), q)| !(limit.lower..=limit.upper).contains(*q)) {
-        warnings.push(format!(
-            "posture `{}`: joint `{name}` is at {q:.4}, outside its limits {:.4} to {:.4}",
-            posture.name, limit.lower, limit.upper
-        ));
-    }
     Ok(warnings)
 }
 
@@ -183,7 +176,10 @@ pub fn undriven(robot: &RobotModel) -> Vec<String> {
     let joints = robot.joint_names.iter().zip(&robot.limits).zip(&robot.actuated);
     let why = joints.filter_map(|((name, limit), &actuated)| {
         if !actuated {
-            Some(format!("joint `{name}` has no motor, and the controller needs one on every joint"))
+            Some(format!(
+                "joint `{name}` has no motor, and the controller needs one on every joint: give it one, or lock it in the companion \
+                 table, [locked] {name} = 0.0"
+            ))
         } else if limit.effort <= 0.0 {
             Some(format!("joint `{name}` has effort 0, so no torque: give its <limit> the largest there is"))
         } else if limit.velocity <= 0.0 {

@@ -18,12 +18,13 @@ use nalgebra::Vector3;
 use urdf_rs::JointType;
 
 use crate::companion::CompanionFile;
+use crate::document::Warning;
 use crate::error::{RobotError, Rule, Subject};
 use crate::inertia;
 use crate::limits::MAX_COORDINATES;
 use crate::load::{BaseChoice, ImpossibleInertia, LoadOptions};
 use crate::mimic::{CoordinateMap, Follower};
-use crate::model::{Attachment, JointLimits, NamedLink, RobotModel, Shape};
+use crate::model::{Attachment, JointLimits, Mesh, NamedLink, RobotModel, Shape};
 use crate::urdf::{Description, Joint as UrdfJoint};
 
 /// A body in the making. Group 0 is the root link with all that is fixed to it.
@@ -55,6 +56,8 @@ struct Assembly<'a> {
     /// Group and pose of every link.
     placed: Vec<Option<(usize, RigidTransform)>>,
     warnings: Vec<String>,
+    /// Whether some body has an inertia that no body has.
+    accept_unreal: bool,
 }
 
 /// Builds the model.
@@ -70,13 +73,27 @@ pub(crate) fn assemble(
         options,
         groups: Vec::new(),
         placed: vec![None; description.links.len()],
-        warnings: description.warnings.clone(),
+        warnings: in_words(&description.warnings),
+        accept_unreal: false,
     };
     let floating_from_world = assembly.collect()?;
+    assembly.check_inertias()?;
     let massive_root = assembly.groups[0].inertia.mass > 0.0;
+    let root = &description.links[description.root];
+    // The convention of the format's users: a root link of this name is the world.
+    let anchored = massive_root && !floating_from_world && root.name == "world" && root.inertia.is_none();
+    if anchored && options.base == BaseChoice::Auto {
+        assembly.warnings.push(format!(
+            "{}:{}: link `world`: a root link of this name is the world, so the robot is fixed to it (base `floating` lets it float)",
+            file.display(),
+            root.line
+        ));
+    }
     let refuse_base = |wanted: String| Err(assembly.refuse_file(Rule::Base { wanted }));
     match &options.base {
-        BaseChoice::Auto => assembly.finish(companion, massive_root || floating_from_world, None),
+        BaseChoice::Auto => {
+            assembly.finish(companion, (massive_root && !anchored) || floating_from_world, None)
+        }
         BaseChoice::Floating if massive_root || floating_from_world => assembly.finish(companion, true, None),
         BaseChoice::Floating => refuse_base("floating: its root link has no mass".to_owned()),
         BaseChoice::Fixed(name) => {
@@ -133,6 +150,10 @@ impl Assembly<'_> {
             has_inertial: false,
         });
         self.place(start, 0, RigidTransform::identity())?;
+        let masses = description.subtree_masses();
+        let inertial = description.subtrees_with_inertial();
+        let accept = self.options.impossible_inertia == ImpossibleInertia::Accept;
+        let mut held = Vec::new();
         let mut open: Vec<usize> = description.children[start].iter().rev().copied().collect();
         while let Some(index) = open.pop() {
             let joint = &description.joints[index];
@@ -140,6 +161,21 @@ impl Assembly<'_> {
             let placement = pose * joint.origin;
             match joint.kind {
                 JointType::Fixed => self.place(joint.child, group, placement)?,
+                // Nothing can be computed of it, and nothing is lost: a frame that was given a joint, or a joint that by its file cannot move.
+                _ if masses[joint.child] == 0.0
+                    && (accept || !inertial[joint.child] || joint.limits.velocity == 0.0) =>
+                {
+                    let error = match inertial[joint.child] {
+                        true => self
+                            .refuse_link(joint.child, Rule::Physics(ModelError::MasslessSubtree { body: 0 })),
+                        false => self.refuse_link(joint.child, Rule::MissingInertial),
+                    };
+                    if self.options.strict {
+                        return Err(error);
+                    }
+                    held.push((error, joint.name.as_str()));
+                    self.place(joint.child, group, placement)?;
+                }
                 _ => {
                     let group = self.add_joint(index, group, placement)?;
                     self.place(joint.child, group, RigidTransform::identity())?;
@@ -147,37 +183,66 @@ impl Assembly<'_> {
             }
             open.extend(description.children[joint.child].iter().rev());
         }
+        for (error, joint) in held {
+            self.warnings.push(format!("{}: its joint `{joint}` is held at 0", error.fault()));
+        }
+        let mut massless = Vec::new();
         for group in &self.groups[1..] {
             if let (Some(link), false) = (group.link, group.has_inertial) {
-                return Err(self.refuse_link(link, Rule::MissingInertial));
+                let error = self.refuse_link(link, Rule::MissingInertial);
+                // Inside the tree it is a joint of several axes; at its end it is a mistake.
+                if masses[link] == 0.0 || self.options.strict {
+                    return Err(error);
+                }
+                massless.push(Warning { error, instead: "here too, as it carries links with mass" });
             }
         }
+        self.warnings.extend(in_words(&massless));
         Ok(start != root)
+    }
+
+    /// Every body as it moves: the links of a group together. A dummy of a milligram on a trunk does no harm, whatever its inertia says.
+    fn check_inertias(&mut self) -> Result<(), RobotError> {
+        for index in 0..self.groups.len() {
+            let group = &self.groups[index];
+            let Some(link) = group.link else { continue };
+            let given = group.given_inertia();
+            let Err(error) = inertia::check(&given) else { continue };
+            let refused = self.refuse_link(link, Rule::Physics(error));
+            let warning = |instead| Warning { error: refused.clone(), instead };
+            let (used, said) = match (self.options.impossible_inertia, error) {
+                _ if inertia::is_round_off(&given) => (given, "that is round-off, and it is used as it is"),
+                (ImpossibleInertia::Repair, error) if is_repairable(&error) => {
+                    (inertia::repair(&given), "the nearest possible inertia is used")
+                }
+                // Only the triangle inequality is a property of real bodies alone; the rest the mathematics needs as well.
+                (ImpossibleInertia::Accept, ModelError::InertiaTriangle { .. }) => {
+                    (given, "it is used all the same")
+                }
+                (ImpossibleInertia::Accept, error) if is_repairable(&error) => {
+                    (inertia::repair(&given), "the nearest possible inertia is used")
+                }
+                _ => return Err(refused),
+            };
+            if self.options.strict {
+                return Err(refused);
+            }
+            let warning = warning(said);
+            self.warnings.push(warning.to_string());
+            self.groups[index].single = Some(used);
+            self.accept_unreal = true;
+        }
+        Ok(())
     }
 
     /// Puts a link into a group, with its inertia.
     fn place(&mut self, link: usize, group: usize, pose: RigidTransform) -> Result<(), RobotError> {
         self.placed[link] = Some((group, pose));
-        let Some(mut given) = self.description.links[link].inertia else { return Ok(()) };
-        if let Err(error) = inertia::check(&given) {
-            let repairable = matches!(
-                error,
-                ModelError::InertiaNotPositive { .. }
-                    | ModelError::InertiaTriangle { .. }
-                    | ModelError::InertiaWithoutMass { .. }
-            );
-            // Only the triangle inequality is a property of real bodies alone; the rest the mathematics needs as well.
-            let acceptable = matches!(error, ModelError::InertiaTriangle { .. });
-            let used = match self.options.impossible_inertia {
-                ImpossibleInertia::Repair if repairable => {
-                    given = inertia::repair(&given);
-                    "The nearest possible inertia is used"
-                }
-                ImpossibleInertia::Accept if acceptable => "It is used all the same",
-                _ => return Err(self.refuse_link(link, Rule::Physics(error))),
-            };
-            let warning = format!("{}. {used}", self.refuse_link(link, Rule::Physics(error)));
-            self.warnings.push(warning.replace(" Remedy:", ""));
+        let Some(given) = self.description.links[link].inertia else { return Ok(()) };
+        if let Err(error @ (ModelError::NegativeMass { .. } | ModelError::NotFinite { .. })) =
+            inertia::check(&given)
+        {
+            return Err(self.refuse_link(link, Rule::Physics(error)));
         }
         let group = &mut self.groups[group];
         let alone = !group.has_inertial && pose == RigidTransform::identity();
@@ -292,13 +357,19 @@ impl Assembly<'_> {
                 NamedLink { name: link.name.clone(), attachment }
             })
             .collect();
-        let mut shapes = Vec::new();
+        let (mut shapes, mut meshes) = (Vec::new(), Vec::new());
         for (link, named) in self.description.links.iter().zip(&links) {
             for shape in &link.shapes {
                 let NamedLink { name, attachment } = named;
                 let attachment = Attachment { body: attachment.body, pose: attachment.pose * shape.pose };
                 let (role, geometry, rgba) = (shape.role, shape.geometry, shape.rgba);
                 shapes.push(Shape { link: name.clone(), attachment, role, geometry, rgba });
+            }
+            for mesh in &link.meshes {
+                let NamedLink { name, attachment } = named;
+                let attachment = Attachment { body: attachment.body, pose: attachment.pose * mesh.pose };
+                let (role, file, scale, rgba) = (mesh.role, mesh.file.clone(), mesh.scale, mesh.rgba);
+                meshes.push(Mesh { link: name.clone(), attachment, role, file, scale, rgba });
             }
         }
         if friction.iter().any(|&friction| friction != 0.0) {
@@ -317,6 +388,7 @@ impl Assembly<'_> {
             friction,
             links,
             shapes,
+            meshes,
             contacts: Vec::new(),
             frames: Vec::new(),
             soles: Vec::new(),
@@ -383,13 +455,13 @@ impl Assembly<'_> {
     fn build_tree(&self, floating: bool, ground: &RigidTransform) -> Result<KinematicTree, RobotError> {
         let gravity_w = self.options.gravity_w;
         let mut builder = if floating {
-            TreeBuilder::floating_base(gravity_w, self.groups[0].link_inertia())
+            TreeBuilder::floating_base(gravity_w, self.groups[0].given_inertia())
         } else {
             let mut builder = TreeBuilder::fixed_base(gravity_w);
             builder.set_ground_inertia(self.groups[0].inertia.transformed(ground));
             builder
         };
-        if self.options.impossible_inertia == ImpossibleInertia::Accept {
+        if self.accept_unreal {
             builder.accept_unreal_inertia();
         }
         for group in &self.groups[1..] {
@@ -401,7 +473,7 @@ impl Assembly<'_> {
                 }
                 parent => Some(parent - usize::from(!floating)),
             };
-            builder.add(Body::new(parent, joint, group.link_inertia()));
+            builder.add(Body::new(parent, joint, group.given_inertia()));
         }
         builder.build().map_err(|error| match body_of(&error) {
             Some(body) => {
@@ -423,16 +495,49 @@ impl Assembly<'_> {
 }
 
 impl Group {
-    fn link_inertia(&self) -> LinkInertia {
+    /// Of all its links together.
+    fn given_inertia(&self) -> LinkInertia {
         if let Some(single) = self.single {
             return single;
         }
+        let inertia = &self.inertia.rotational;
         if self.inertia.mass <= 0.0 {
-            return LinkInertia::massless();
+            return LinkInertia::new(0.0, Vector3::zeros(), (inertia + inertia.transpose()) * 0.5);
         }
         let (com, inertia) = self.inertia.to_central();
-        LinkInertia::new(self.inertia.mass, com, (inertia + inertia.transpose()) * 0.5)
+        let symmetric = (inertia + inertia.transpose()) * 0.5;
+        inertia::without_round_off(LinkInertia::new(self.inertia.mass, com, symmetric))
     }
+}
+
+/// Whether the nearest possible inertia is a way out.
+fn is_repairable(error: &ModelError) -> bool {
+    matches!(
+        error,
+        ModelError::InertiaNotPositive { .. }
+            | ModelError::InertiaTriangle { .. }
+            | ModelError::InertiaWithoutMass { .. }
+    )
+}
+
+/// Warnings as lines; of many of one kind the first one, and how many there are.
+fn in_words(warnings: &[Warning]) -> Vec<String> {
+    let mut kinds: Vec<(&Warning, usize)> = Vec::new();
+    for warning in warnings {
+        let alike = |(first, _): &&mut (&Warning, usize)| {
+            first.instead == warning.instead
+                && std::mem::discriminant(first.error.rule()) == std::mem::discriminant(warning.error.rule())
+        };
+        match kinds.iter_mut().find(alike) {
+            Some((_, count)) => *count += 1,
+            None => kinds.push((warning, 1)),
+        }
+    }
+    let line = |(first, count): &(&Warning, usize)| match count {
+        1 => first.to_string(),
+        count => format!("{first} (and {} more of this kind)", count - 1),
+    };
+    kinds.iter().map(line).collect()
 }
 
 /// Two directions in the plane with the given unit normal, and names for the three coordinates.

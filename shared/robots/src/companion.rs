@@ -3,6 +3,10 @@
 //! ```toml
 //! format = 1
 //! passive = ["ankle"]                       # joints without a motor
+//! accept_impossible_inertia = false         # take inertias that no body has, hold joints that carry no mass
+//!
+//! [locked]                                  # joints that do not move, and where they stand, rad or m
+//! finger = 0.4
 //!
 //! [[contact]]                               # points that may touch the ground, link frame
 //! name = "toe"
@@ -46,7 +50,8 @@ use toml::Spanned;
 
 use crate::document::line_of;
 use crate::error::{RobotError, Rule, Subject, shorten};
-use crate::model::{Attachment, ContactPoint, NamedFrame, Posture, RobotModel, Sole};
+use crate::model::{Attachment, ContactPoint, JointLimits, NamedFrame, Posture, RobotModel, Sole};
+use crate::urdf::Description;
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -54,6 +59,10 @@ struct Tables {
     format: Spanned<u32>,
     #[serde(default)]
     passive: Vec<Spanned<String>>,
+    #[serde(default)]
+    accept_impossible_inertia: bool,
+    #[serde(default)]
+    locked: BTreeMap<Spanned<String>, f64>,
     #[serde(default)]
     contact: Vec<Spanned<ContactTable>>,
     #[serde(default)]
@@ -145,6 +154,28 @@ impl CompanionFile {
     fn error<T>(&self, at: &Spanned<T>, entry: &str, rule: Rule) -> RobotError {
         let line = line_of(&self.text, at.span().start);
         RobotError::new(&self.path, Some(line), Subject::Entry(entry.to_owned()), rule)
+    }
+
+    /// Whether the table says so.
+    pub(crate) fn accepts_impossible_inertia(&self) -> bool {
+        self.tables.accept_impossible_inertia
+    }
+
+    /// Makes the joints that the table locks fixed ones, at their places.
+    pub(crate) fn lock(&self, description: &mut Description) -> Result<(), RobotError> {
+        for (name, &value) in &self.tables.locked {
+            let entry = format!("locked `{}`", shorten(name.get_ref()));
+            let refuse = |rule| self.error(name, &entry, rule);
+            let found = description.joints.iter_mut().find(|joint| joint.name == *name.get_ref());
+            let Some(joint) = found else {
+                return Err(refuse(Rule::Unknown { kind: "joint", name: shorten(name.get_ref()) }));
+            };
+            if !value.is_finite() {
+                return Err(refuse(Rule::BadNumber { key: "the place of a locked joint" }));
+            }
+            joint.hold_at(value).map_err(|kind| refuse(Rule::UnsupportedJoint { kind }))?;
+        }
+        Ok(())
     }
 
     /// Joint coordinates without a motor, and the springs, by coordinate.
@@ -301,15 +332,17 @@ impl CompanionFile {
                 if !value.is_finite() {
                     return refuse(Rule::BadNumber { key: "a joint coordinate" });
                 }
-                let limits = &model.limits[joint];
-                if value < limits.lower || value > limits.upper {
-                    let name = shorten(name);
-                    model.warnings.push(format!(
-                        "{entry}: joint `{name}` at {value} is outside its limits {} to {}",
-                        limits.lower, limits.upper
-                    ));
-                }
                 q[joint] = value;
+            }
+            // Those that are not named too, which are at 0.
+            for ((name, limits), value) in model.joint_names.iter().zip(&model.limits).zip(&q) {
+                if *value < limits.lower || *value > limits.upper {
+                    let (name, JointLimits { lower, upper, .. }) = (shorten(name), limits);
+                    let warning = format!(
+                        "{entry}: joint `{name}` at {value} is outside its limits {lower} to {upper}"
+                    );
+                    model.warnings.push(warning);
+                }
             }
             model.postures.push(Posture {
                 name: table.name.clone(),

@@ -3,6 +3,9 @@
 //! The scan comes first because neither urdf-rs nor the libraries below it bound anything: nesting, attributes per element
 //! and elements are counted over the raw bytes, in one pass and without memory.
 
+use std::borrow::Cow;
+use std::cell::RefCell;
+use std::fmt;
 use std::path::Path;
 
 use roxmltree::{Node, ParsingOptions};
@@ -16,6 +19,22 @@ pub(crate) struct Document<'input> {
     xml: roxmltree::Document<'input>,
     /// Offsets of all line ends: every link and joint asks for its line.
     line_ends: Vec<u32>,
+    warnings: RefCell<Vec<Warning>>,
+}
+
+/// Something that is read although it is not as it should be.
+#[derive(Clone, Debug)]
+pub(crate) struct Warning {
+    /// What is wrong.
+    pub error: RobotError,
+    /// What is done instead.
+    pub instead: &'static str,
+}
+
+impl fmt::Display for Warning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: {}", self.error.fault(), self.instead)
+    }
 }
 
 impl<'input> Document<'input> {
@@ -35,7 +54,7 @@ impl<'input> Document<'input> {
         })?;
         let line_ends =
             (0u32..).zip(text.bytes()).filter(|&(_, byte)| byte == b'\n').map(|(at, _)| at).collect();
-        let document = Self { file, xml, line_ends };
+        let document = Self { file, xml, line_ends, warnings: RefCell::default() };
         let root = document.root();
         if root.tag_name().name() != "robot" {
             let found = shorten(root.tag_name().name());
@@ -55,6 +74,16 @@ impl<'input> Document<'input> {
 
     pub(crate) fn error(&self, node: Node<'_, '_>, subject: Subject, rule: Rule) -> RobotError {
         RobotError::new(self.file, Some(self.line(node)), subject, rule)
+    }
+
+    /// Remembers something that is read all the same.
+    pub(crate) fn warn(&self, error: RobotError, instead: &'static str) {
+        self.warnings.borrow_mut().push(Warning { error, instead });
+    }
+
+    /// Everything that was remembered.
+    pub(crate) fn take_warnings(&self) -> Vec<Warning> {
+        self.warnings.take()
     }
 
     /// The one child element `name`, if there is one.
@@ -164,6 +193,34 @@ pub(crate) fn elements<'a, 'input: 'a>(
 pub(crate) fn line_of(text: &str, offset: usize) -> u32 {
     let before = &text.as_bytes()[..offset.min(text.len())];
     1 + before.iter().filter(|&&byte| byte == b'\n').count() as u32
+}
+
+/// The text with the content of comments that hold two dashes blanked out, and the lines of these. Many files have them as rulers; a
+/// parser of XML has to refuse them.
+pub(crate) fn without_dashes(text: &str) -> (Cow<'_, str>, Vec<u32>) {
+    let (mut clean, mut lines) = (String::new(), Vec::new());
+    let (mut at, mut copied, mut line) = (0, 0, 1);
+    while let Some(open) = find(text.as_bytes(), at, b"<!--") {
+        let Some(end) = find(text.as_bytes(), open + 4, b"-->") else { break };
+        line += count_lines(&text[at..open]);
+        let content = &text[open + 4..end];
+        if content.contains("--") || content.ends_with('-') {
+            clean.push_str(&text[copied..open + 4]);
+            clean.extend(content.bytes().map(|byte| if byte == b'\n' { '\n' } else { ' ' }));
+            copied = end;
+            lines.push(line);
+        }
+        line += count_lines(&text[open..end + 3]);
+        at = end + 3;
+    }
+    if lines.is_empty() {
+        return (Cow::Borrowed(text), lines);
+    }
+    (Cow::Owned(clean + &text[copied..]), lines)
+}
+
+fn count_lines(text: &str) -> u32 {
+    text.bytes().filter(|&byte| byte == b'\n').count() as u32
 }
 
 /// Bounds nesting, elements and attributes. Malformed XML is left to the parser.

@@ -193,14 +193,16 @@ impl Rule {
             Self::Cycle => "a URDF is a tree: cut the loop and state it as a constraint",
             Self::TwoRoots { .. } => "join the parts by a joint, or put them in two files",
             Self::MissingInertial => {
-                "give it <inertial> with mass and inertia (mass 0 if it is meant to have none), or fix its joint"
+                "give it <inertial> with mass and inertia, fix its joint, or have such joints held (accept_impossible_inertia = true in the companion table)"
             }
-            Self::Physics(ModelError::MasslessSubtree { .. }) => "give it or a link it carries a mass",
+            Self::Physics(ModelError::MasslessSubtree { .. }) => {
+                "give it or a link it carries a mass, lock its joint in the companion table, or have such joints held (accept_impossible_inertia = true there)"
+            }
             Self::Physics(ModelError::NegativeMass { .. } | ModelError::NegativeDamping { .. }) => {
                 "give a value that is not negative"
             }
             Self::Physics(_) => {
-                "correct the inertia (about the mass centre, kg m^2), or have it accepted (--accept-impossible-inertia)"
+                "correct the inertia (about the mass centre, kg m^2), or have it accepted: accept_impossible_inertia = true in the companion table, or --set robot.accept_impossible_inertia=true for one run"
             }
             Self::UnsupportedJoint { .. } => {
                 "use revolute, continuous, prismatic, planar or fixed joints; a floating joint only from an empty root link"
@@ -265,16 +267,18 @@ impl RobotError {
     pub fn rule(&self) -> &Rule {
         &self.details.rule
     }
+
+    /// `file:line: subject: rule`, without the remedy.
+    pub(crate) fn fault(&self) -> String {
+        let Details { file, line, subject, rule } = &*self.details;
+        let line = line.map_or_else(String::new, |line| format!(":{line}"));
+        format!("{}{line}: {subject}{rule}", file.display())
+    }
 }
 
 impl fmt::Display for RobotError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Details { file, line, subject, rule } = &*self.details;
-        write!(f, "{}", file.display())?;
-        if let Some(line) = line {
-            write!(f, ":{line}")?;
-        }
-        write!(f, ": {subject}{rule}. Remedy: {}", rule.remedy())
+        write!(f, "{}. Remedy: {}", self.fault(), self.details.rule.remedy())
     }
 }
 

@@ -15,6 +15,24 @@ pub(crate) fn check(inertia: &LinkInertia) -> Result<(), ModelError> {
     }
 }
 
+/// Model files have as few as three digits: a plate may break the triangle inequality by this part of its largest moment.
+const ROUND_OFF: f64 = 5e-3;
+
+/// Whether the triangle inequality is broken by no more than the digits of a model file.
+pub(crate) fn is_round_off(inertia: &LinkInertia) -> bool {
+    let Err(ModelError::InertiaTriangle { excess, .. }) = check(inertia) else { return false };
+    excess <= ROUND_OFF * inertia.inertia.symmetric_eigenvalues().amax()
+}
+
+/// Square of a length that no link of a robot is shorter than, m²: inertias below mass times this are round-off around 0.
+const SHORTEST_M2: f64 = 1e-14;
+
+/// The inertia, 0 where it is nothing but round-off: the remains of a difference, of either sign.
+pub(crate) fn without_round_off(inertia: LinkInertia) -> LinkInertia {
+    let is_nothing = inertia.mass > 0.0 && inertia.inertia.amax() <= SHORTEST_M2 * inertia.mass;
+    if is_nothing { LinkInertia { inertia: Matrix3::zeros(), ..inertia } } else { inertia }
+}
+
 /// The nearest inertia that a body can have, keeping mass, mass centre and principal axes.
 pub(crate) fn repair(inertia: &LinkInertia) -> LinkInertia {
     let symmetric = (inertia.inertia + inertia.inertia.transpose()) * 0.5;

@@ -22,7 +22,9 @@
 //! | `floating` from an empty root | floating base; anywhere else refused |
 //! | `spherical` | refused |
 //! | `<mimic>` | a full coordinate in the tree and a row of [`CoordinateMap`]; see there what works with it |
-//! | meshes | never opened |
+//! | meshes | never opened; [`RobotModel::meshes`] names their files |
+//! | decoration that cannot be read | left out, with a warning ([`LoadOptions::strict`]: an error) |
+//! | root link `world` without mass | the world itself: fixed base, with a warning |
 //!
 //! Joint coordinates are numbered depth-first, branches in the order of the file. Nothing is defaulted silently: a link that
 //! moves without `<inertial>`, a revolute joint without `<limit>`, an inertia no body can have are errors that name the file,
@@ -36,6 +38,7 @@ mod assemble;
 mod companion;
 mod document;
 mod error;
+mod facts;
 mod inertia;
 pub mod limits;
 mod load;
@@ -48,7 +51,7 @@ pub use error::{RobotError, Rule, Subject};
 pub use load::{BaseChoice, Companion, ImpossibleInertia, LoadOptions, load, load_str, load_with};
 pub use mimic::CoordinateMap;
 pub use model::{
-    Attachment, ContactPoint, Geometry, JointLimits, NamedFrame, NamedLink, Posture, RobotModel, Shape,
+    Attachment, ContactPoint, Geometry, JointLimits, Mesh, NamedFrame, NamedLink, Posture, RobotModel, Shape,
     ShapeRole, Sole,
 };
 pub use rooted::RootedModel;

@@ -34,7 +34,8 @@ pub enum ImpossibleInertia {
     Refuse,
     /// Take the nearest possible inertia and say so in [`RobotModel::warnings`].
     Repair,
-    /// Take it as it is and say so in [`RobotModel::warnings`]: the mathematics goes through, the robot is not of this world.
+    /// Take it as it is and say so in [`RobotModel::warnings`]: the mathematics goes through, the robot is not of this world. A joint that
+    /// carries no mass at all, which no mathematics moves, is held at 0.
     Accept,
 }
 
@@ -61,6 +62,8 @@ pub struct LoadOptions {
     pub impossible_inertia: ImpossibleInertia,
     /// Companion file.
     pub companion: Companion,
+    /// Whether what is read all the same, with a warning, is an error: decoration that cannot be read, values that are missing.
+    pub strict: bool,
 }
 
 impl Default for LoadOptions {
@@ -70,6 +73,7 @@ impl Default for LoadOptions {
             gravity_w: Vector3::new(0.0, 0.0, -9.81),
             impossible_inertia: ImpossibleInertia::default(),
             companion: Companion::default(),
+            strict: false,
         }
     }
 }
@@ -131,8 +135,18 @@ fn build(
     options: &LoadOptions,
 ) -> Result<RobotModel, RobotError> {
     let urdf = urdf.trim_start_matches('\u{feff}');
-    let description = Description::read(path, urdf)?;
-    assemble(path, &description, companion, options)
+    let mut description = Description::read(path, urdf)?;
+    if let (true, Some(warning)) = (options.strict, description.warnings.first()) {
+        return Err(warning.error.clone());
+    }
+    let mut options = options.clone();
+    if let Some(companion) = companion {
+        companion.lock(&mut description)?;
+        if companion.accepts_impossible_inertia() && options.impossible_inertia == ImpossibleInertia::Refuse {
+            options.impossible_inertia = ImpossibleInertia::Accept;
+        }
+    }
+    assemble(path, &description, companion, &options)
 }
 
 fn check_size(path: &Path, size: usize, limit: usize) -> Result<(), RobotError> {

@@ -36,6 +36,8 @@ pub struct RobotModel {
     pub links: Vec<NamedLink>,
     /// Shapes for drawing.
     pub shapes: Vec<Shape>,
+    /// Meshes, by the names of their files. They are not opened.
+    pub meshes: Vec<Mesh>,
     /// Contact points.
     pub contacts: Vec<ContactPoint>,
     /// Named frames: soles, hand points.
@@ -190,6 +192,23 @@ pub struct Shape {
     pub role: ShapeRole,
     /// The primitive.
     pub geometry: Geometry,
+    /// Red, green, blue, alpha in 0..1, where the file gives a colour.
+    pub rgba: Option<[f64; 4]>,
+}
+
+/// A mesh of the URDF and where it is.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mesh {
+    /// The URDF link it belongs to.
+    pub link: String,
+    /// Where it is.
+    pub attachment: Attachment,
+    /// Visual or collision.
+    pub role: ShapeRole,
+    /// Its file as the URDF names it: a path, `package://…` or `file://…`.
+    pub file: String,
+    /// Factors along its x, y, z.
+    pub scale: Vector3<f64>,
     /// Red, green, blue, alpha in 0..1, where the file gives a colour.
     pub rgba: Option<[f64; 4]>,
 }

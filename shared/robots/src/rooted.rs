@@ -3,7 +3,7 @@
 use delmpc_mechanics::reroot::Rerooted;
 
 use crate::error::{RobotError, Rule, Subject};
-use crate::model::{Attachment, ContactPoint, NamedFrame, NamedLink, Posture, RobotModel, Shape};
+use crate::model::{Attachment, ContactPoint, Mesh, NamedFrame, NamedLink, Posture, RobotModel, Shape};
 
 /// The robot with a fixed base at a frame, and the maps from and to the floating robot.
 #[derive(Clone, Debug)]
@@ -56,6 +56,11 @@ impl RobotModel {
                 .shapes
                 .iter()
                 .map(|shape| Shape { attachment: moved(&shape.attachment), ..shape.clone() })
+                .collect(),
+            meshes: self
+                .meshes
+                .iter()
+                .map(|mesh| Mesh { attachment: moved(&mesh.attachment), ..mesh.clone() })
                 .collect(),
             contacts: self
                 .contacts

@@ -1,19 +1,19 @@
 //! URDF text to a checked description: links, joints, and the tree they form.
 //!
-//! Values come from `urdf-rs`. Presence and form come from the XML itself, read first, because `urdf-rs` takes what is missing
-//! for zero (mass, limits, effort) and skips words that are not numbers.
+//! Values come from `urdf-rs`. Presence and form come from the XML itself, read first: see `facts`.
 
 use std::collections::HashMap;
 use std::path::Path;
 
-use delmpc_mechanics::spatial::RigidTransform;
+use delmpc_mechanics::spatial::{RigidTransform, exp_rotation};
 use delmpc_mechanics::tree::LinkInertia;
 use nalgebra::{Matrix3, Vector3};
-use roxmltree::Node;
 use urdf_rs::JointType;
 
-use crate::document::{Document, elements};
+use crate::document::{Document, Warning, without_dashes};
 use crate::error::{RobotError, Rule, Subject, shorten};
+use crate::facts::{Facts, LinkFacts};
+use crate::inertia::without_round_off;
 use crate::model::{Geometry, JointLimits, ShapeRole};
 
 /// A robot as its URDF describes it; the joints form a tree rooted at `root`.
@@ -24,7 +24,8 @@ pub(crate) struct Description {
     pub root: usize,
     /// Joints that leave every link, in the order of the file.
     pub children: Vec<Vec<usize>>,
-    pub warnings: Vec<String>,
+    /// What was read all the same.
+    pub warnings: Vec<Warning>,
 }
 
 pub(crate) struct Link {
@@ -33,6 +34,16 @@ pub(crate) struct Link {
     /// In the link frame; `None` when the file has no `<inertial>`.
     pub inertia: Option<LinkInertia>,
     pub shapes: Vec<LinkShape>,
+    pub meshes: Vec<LinkMesh>,
+}
+
+/// A mesh, never opened here.
+pub(crate) struct LinkMesh {
+    pub pose: RigidTransform,
+    pub role: ShapeRole,
+    pub file: String,
+    pub scale: Vector3<f64>,
+    pub rgba: Option<[f64; 4]>,
 }
 
 pub(crate) struct LinkShape {
@@ -58,11 +69,64 @@ pub(crate) struct Joint {
     pub mimic: Option<(usize, f64, f64)>,
 }
 
+impl Joint {
+    /// Makes it a fixed joint where it stands at a coordinate. `Err` names a kind that has not one coordinate.
+    pub(crate) fn hold_at(&mut self, value: f64) -> Result<(), &'static str> {
+        let motion = match self.kind {
+            JointType::Fixed => return Ok(()),
+            JointType::Revolute | JointType::Continuous => {
+                RigidTransform { rotation: exp_rotation(&(self.axis * value)), translation: Vector3::zeros() }
+            }
+            JointType::Prismatic => RigidTransform::from_translation(self.axis * value),
+            JointType::Planar => return Err("locked planar"),
+            JointType::Floating => return Err("locked floating"),
+            JointType::Spherical => return Err("locked spherical"),
+        };
+        self.origin = self.origin * motion;
+        self.kind = JointType::Fixed;
+        self.mimic = None;
+        Ok(())
+    }
+}
+
 impl Description {
+    /// Mass of every link and of all it carries.
+    pub(crate) fn subtree_masses(&self) -> Vec<f64> {
+        let of_link = |link: &Link| link.inertia.map_or(0.0, |inertia| inertia.mass);
+        self.over_subtrees(self.links.iter().map(of_link).collect(), |sum, carried| sum + carried)
+    }
+
+    /// Whether a link or one that it carries has `<inertial>`.
+    pub(crate) fn subtrees_with_inertial(&self) -> Vec<bool> {
+        let of_link = |link: &Link| link.inertia.is_some();
+        self.over_subtrees(self.links.iter().map(of_link).collect(), |here, carried| here || carried)
+    }
+
+    /// Values of links joined with those of all they carry, from the leaves to the root.
+    fn over_subtrees<T: Copy>(&self, mut values: Vec<T>, join: impl Fn(T, T) -> T) -> Vec<T> {
+        let mut order = vec![self.root];
+        let mut next = 0;
+        while let Some(&link) = order.get(next) {
+            order.extend(self.children[link].iter().map(|&joint| self.joints[joint].child));
+            next += 1;
+        }
+        for &link in order.iter().rev() {
+            for &joint in &self.children[link] {
+                values[link] = join(values[link], values[self.joints[joint].child]);
+            }
+        }
+        values
+    }
+
     pub(crate) fn read(file: &Path, text: &str) -> Result<Self, RobotError> {
-        let document = Document::parse(file, text)?;
+        let (text, dashed) = without_dashes(text);
+        let document = Document::parse(file, &text)?;
+        for line in dashed {
+            let rule = Rule::Xml("two dashes in a comment, which XML does not allow".to_owned());
+            document.warn(RobotError::new(file, Some(line), Subject::File, rule), "it is read all the same");
+        }
         let facts = Facts::check(&document)?;
-        let robot = urdf_rs::read_from_string(text).map_err(|error| {
+        let robot = urdf_rs::read_from_string(&facts.text).map_err(|error| {
             RobotError::new(file, None, Subject::File, Rule::Xml(shorten(&error.to_string())))
         })?;
         let same = robot.links.len() == facts.links.len()
@@ -75,217 +139,6 @@ impl Description {
         }
         describe(&document, &robot, &facts)
     }
-}
-
-/// What the XML says by being there.
-struct Facts {
-    links: Vec<LinkFacts>,
-    joints: Vec<JointFacts>,
-}
-
-struct LinkFacts {
-    name: String,
-    line: u32,
-    inertial: bool,
-}
-
-struct JointFacts {
-    name: String,
-    line: u32,
-    limit: bool,
-}
-
-impl Facts {
-    fn check(document: &Document<'_>) -> Result<Self, RobotError> {
-        let root = document.root();
-        let has_xacro = root
-            .descendants()
-            .any(|node| node.tag_name().namespace().is_some_and(|uri| uri.contains("xacro")));
-        if has_xacro {
-            let rule = Rule::Xml("it still has xacro elements".to_owned());
-            return Err(document.error(root, Subject::File, rule));
-        }
-        let unlimited_by_default = version(root) >= (1, 2);
-        let mut facts = Self { links: Vec::new(), joints: Vec::new() };
-        for node in elements(root, "link") {
-            facts.links.push(check_link(document, node)?);
-        }
-        if facts.links.is_empty() {
-            return Err(document.error(root, Subject::File, Rule::Missing { what: "a <link>" }));
-        }
-        for node in elements(root, "joint") {
-            facts.joints.push(check_joint(document, node, unlimited_by_default)?);
-        }
-        Ok(facts)
-    }
-}
-
-fn version(root: Node<'_, '_>) -> (u32, u32) {
-    let parse = |text: &str| {
-        let (major, minor) = text.trim().split_once('.')?;
-        Some((major.parse().ok()?, minor.parse().ok()?))
-    };
-    root.attribute("version").and_then(parse).unwrap_or((1, 0))
-}
-
-fn check_link<'i>(document: &Document<'i>, node: Node<'_, 'i>) -> Result<LinkFacts, RobotError> {
-    let name = document.text(node, "name", "the name of a link", &Subject::File)?.to_owned();
-    let subject = Subject::Link(name.clone());
-    let inertial = document.child(node, "inertial", &subject)?;
-    if let Some(inertial) = inertial {
-        check_origin(document, inertial, &subject)?;
-        let mass = document.required(inertial, "mass", "<mass> of <inertial>", &subject)?;
-        document.text(mass, "value", "the value of <mass>", &subject)?;
-        document.finite::<1>(mass, "value", &subject)?;
-        let inertia = document.required(inertial, "inertia", "<inertia> of <inertial>", &subject)?;
-        for (attribute, what) in [
-            ("ixx", "ixx of <inertia>"),
-            ("ixy", "ixy of <inertia>"),
-            ("ixz", "ixz of <inertia>"),
-            ("iyy", "iyy of <inertia>"),
-            ("iyz", "iyz of <inertia>"),
-            ("izz", "izz of <inertia>"),
-        ] {
-            document.text(inertia, attribute, what, &subject)?;
-            document.finite::<1>(inertia, attribute, &subject)?;
-        }
-    }
-    for role in ["visual", "collision"] {
-        for shape in elements(node, role) {
-            check_origin(document, shape, &subject)?;
-            let geometry = document.required(shape, "geometry", "<geometry> of a shape", &subject)?;
-            check_geometry(document, geometry, &subject)?;
-            if let Some(material) = document.child(shape, "material", &subject)? {
-                document.text(material, "name", "the name of <material>", &subject)?;
-                check_material(document, material, &subject)?;
-            }
-        }
-    }
-    Ok(LinkFacts { name, line: document.line(node), inertial: inertial.is_some() })
-}
-
-fn check_material<'i>(
-    document: &Document<'i>,
-    node: Node<'_, 'i>,
-    subject: &Subject,
-) -> Result<(), RobotError> {
-    if let Some(color) = document.child(node, "color", subject)? {
-        document.text(color, "rgba", "rgba of <color>", subject)?;
-        document.finite::<4>(color, "rgba", subject)?;
-    }
-    Ok(())
-}
-
-fn check_origin<'i>(
-    document: &Document<'i>,
-    parent: Node<'_, 'i>,
-    subject: &Subject,
-) -> Result<(), RobotError> {
-    if let Some(origin) = document.child(parent, "origin", subject)? {
-        document.finite::<3>(origin, "xyz", subject)?;
-        document.finite::<3>(origin, "rpy", subject)?;
-        document.finite::<4>(origin, "quat_xyzw", subject)?;
-    }
-    Ok(())
-}
-
-fn check_geometry<'i>(
-    document: &Document<'i>,
-    node: Node<'_, 'i>,
-    subject: &Subject,
-) -> Result<(), RobotError> {
-    let what = "one of <box>, <cylinder>, <capsule>, <sphere>, <mesh> in <geometry>";
-    let mut shapes = node.children().filter(Node::is_element);
-    let (Some(shape), None) = (shapes.next(), shapes.next()) else {
-        return Err(document.error(node, subject.clone(), Rule::Missing { what }));
-    };
-    let length = |attribute: &'static str, what| {
-        document.text(shape, attribute, what, subject)?;
-        document.finite::<1>(shape, attribute, subject)
-    };
-    match shape.tag_name().name() {
-        "box" => {
-            document.text(shape, "size", "the size of <box>", subject)?;
-            document.finite::<3>(shape, "size", subject)?;
-        }
-        "cylinder" | "capsule" => {
-            length("radius", "the radius of a shape")?;
-            length("length", "the length of a shape")?;
-        }
-        "sphere" => {
-            length("radius", "the radius of a shape")?;
-        }
-        "mesh" => {
-            document.text(shape, "filename", "the filename of <mesh>", subject)?;
-            document.finite::<3>(shape, "scale", subject)?;
-        }
-        _ => return Err(document.error(node, subject.clone(), Rule::Missing { what })),
-    }
-    Ok(())
-}
-
-fn check_joint<'i>(
-    document: &Document<'i>,
-    node: Node<'_, 'i>,
-    unlimited_by_default: bool,
-) -> Result<JointFacts, RobotError> {
-    let name = document.text(node, "name", "the name of a joint", &Subject::File)?.to_owned();
-    let subject = Subject::Joint(name.clone());
-    let kind = document.text(node, "type", "the type of the joint", &subject)?;
-    let known =
-        ["revolute", "continuous", "prismatic", "fixed", "floating", "planar", "spherical"].contains(&kind);
-    if !known {
-        let rule = Rule::Xml(format!("`{}` is not a joint type", shorten(kind)));
-        return Err(document.error(node, subject, rule));
-    }
-    check_origin(document, node, &subject)?;
-    for (element, what, link) in
-        [("parent", "<parent>", "the link of <parent>"), ("child", "<child>", "the link of <child>")]
-    {
-        let end = document.required(node, element, what, &subject)?;
-        document.text(end, "link", link, &subject)?;
-    }
-    if let Some(axis) = document.child(node, "axis", &subject)? {
-        document.text(axis, "xyz", "xyz of <axis>", &subject)?;
-        document.finite::<3>(axis, "xyz", &subject)?;
-    }
-    if let Some(dynamics) = document.child(node, "dynamics", &subject)? {
-        document.finite::<1>(dynamics, "damping", &subject)?;
-        document.finite::<1>(dynamics, "friction", &subject)?;
-    }
-    if let Some(mimic) = document.child(node, "mimic", &subject)? {
-        document.text(mimic, "joint", "the joint of <mimic>", &subject)?;
-        document.finite::<1>(mimic, "multiplier", &subject)?;
-        document.finite::<1>(mimic, "offset", &subject)?;
-    }
-    let limit = document.child(node, "limit", &subject)?;
-    let missing = |at, what| Err(document.error(at, subject.clone(), Rule::Missing { what }));
-    let bounded = kind == "revolute" || kind == "prismatic";
-    match limit {
-        None if bounded => {
-            return missing(node, "<limit> (a turning joint without stops is of type continuous)");
-        }
-        None => {}
-        Some(limit) => {
-            let mut present = [false; 4];
-            for (present, attribute) in present.iter_mut().zip(["lower", "upper", "effort", "velocity"]) {
-                *present = document.limit(limit, attribute, &subject)?.is_some();
-            }
-            let [lower, upper, effort, velocity] = present;
-            if !unlimited_by_default {
-                if bounded && !lower && !upper {
-                    return missing(limit, "lower and upper of <limit>");
-                }
-                if !effort {
-                    return missing(limit, "effort of <limit> (readers take it for 0)");
-                }
-                if !velocity {
-                    return missing(limit, "velocity of <limit>");
-                }
-            }
-        }
-    }
-    Ok(JointFacts { name, line: document.line(node), limit: limit.is_some() })
 }
 
 fn describe(
@@ -312,33 +165,12 @@ fn describe(
         .iter()
         .filter_map(|material| Some((material.name.as_str(), material.color.as_ref()?.rgba.0)))
         .collect();
-    let mut meshes = 0;
-    let mut links = Vec::with_capacity(robot.links.len());
-    for (link, fact) in robot.links.iter().zip(&facts.links) {
-        let visual = link.visual.iter().map(|visual| {
-            let material = visual.material.as_ref();
-            let own = material.and_then(|m| m.color.as_ref()).map(|color| color.rgba.0);
-            let rgba = own.or_else(|| material.and_then(|m| colors.get(m.name.as_str()).copied()));
-            (ShapeRole::Visual, &visual.origin, &visual.geometry, rgba)
-        });
-        let collision = link
-            .collision
-            .iter()
-            .map(|collision| (ShapeRole::Collision, &collision.origin, &collision.geometry, None));
-        let mut shapes = Vec::new();
-        for (role, origin, geometry, rgba) in visual.chain(collision) {
-            match primitive(geometry) {
-                Some(geometry) => shapes.push(LinkShape { pose: pose(origin), role, geometry, rgba }),
-                None => meshes += 1,
-            }
-        }
-        links.push(Link {
-            name: fact.name.clone(),
-            line: fact.line,
-            inertia: fact.inertial.then(|| link_inertia(&link.inertial)),
-            shapes,
-        });
-    }
+    let links = robot
+        .links
+        .iter()
+        .zip(&facts.links)
+        .map(|(link, fact)| described(link, fact, &colors))
+        .collect::<Vec<_>>();
 
     let mut joints = Vec::with_capacity(robot.joints.len());
     let mut children = vec![Vec::new(); links.len()];
@@ -352,15 +184,14 @@ fn describe(
                 .ok_or_else(|| refuse(Rule::Unknown { kind: "link", name: shorten(name) }))
         };
         let (parent, child) = (find_link(&joint.parent.link)?, find_link(&joint.child.link)?);
-        let mimic = match &joint.mimic {
-            None => None,
-            Some(mimic) => {
-                let followed = joint_index.get(mimic.joint.as_str()).copied();
-                let followed = followed
-                    .ok_or_else(|| refuse(Rule::Unknown { kind: "joint", name: shorten(&mimic.joint) }))?;
-                Some((followed, mimic.multiplier.unwrap_or(1.0), mimic.offset.unwrap_or(0.0)))
-            }
-        };
+        let mimic = joint.mimic.as_ref().and_then(|mimic| {
+            let Some(&followed) = joint_index.get(mimic.joint.as_str()) else {
+                let unknown = refuse(Rule::Unknown { kind: "joint", name: shorten(&mimic.joint) });
+                document.warn(unknown, "it moves by itself");
+                return None;
+            };
+            Some((followed, mimic.multiplier.unwrap_or(1.0), mimic.offset.unwrap_or(0.0)))
+        });
         if let Some(first) = carried_by[child] {
             let rule =
                 Rule::TwoParents { first: facts.joints[first].name.clone(), second: fact.name.clone() };
@@ -374,7 +205,7 @@ fn describe(
             name: fact.name.clone(),
             line: fact.line,
             kind: joint.joint_type.clone(),
-            origin: pose(&joint.origin),
+            origin: turned(pose(&joint.origin), fact.rotation),
             parent,
             child,
             axis: axis(joint).ok_or_else(|| refuse(Rule::ZeroAxis))?,
@@ -386,11 +217,32 @@ fn describe(
     }
 
     let root = find_root(document, &links, &carried_by, &children, &joints)?;
-    let mut warnings = Vec::new();
-    if meshes > 0 {
-        warnings.push(format!("{meshes} mesh shapes are not drawn (meshes are never opened)"));
-    }
+    let warnings = document.take_warnings();
     Ok(Description { name: robot.name.clone(), links, joints, root, children, warnings })
+}
+
+/// A link with its shapes.
+fn described(link: &urdf_rs::Link, fact: &LinkFacts, colors: &HashMap<&str, [f64; 4]>) -> Link {
+    let visual = link.visual.iter().zip(&fact.visual_rotations).map(|(visual, &rotation)| {
+        let material = visual.material.as_ref();
+        let own = material.and_then(|m| m.color.as_ref()).map(|color| color.rgba.0);
+        let rgba = own.or_else(|| material.and_then(|m| colors.get(m.name.as_str()).copied()));
+        (ShapeRole::Visual, turned(pose(&visual.origin), rotation), &visual.geometry, rgba)
+    });
+    let collision = link.collision.iter().zip(&fact.collision_rotations).map(|(collision, &rotation)| {
+        (ShapeRole::Collision, turned(pose(&collision.origin), rotation), &collision.geometry, None)
+    });
+    let (mut shapes, mut meshes) = (Vec::new(), Vec::new());
+    for (role, pose, geometry, rgba) in visual.chain(collision) {
+        if let Some(geometry) = primitive(geometry) {
+            shapes.push(LinkShape { pose, role, geometry, rgba });
+        } else if let urdf_rs::Geometry::Mesh { filename, scale } = geometry {
+            let scale = scale.map_or(Vector3::repeat(1.0), |scale| Vector3::from(scale.0));
+            meshes.push(LinkMesh { pose, role, file: filename.clone(), scale, rgba });
+        }
+    }
+    let inertia = fact.inertial.then(|| link_inertia(&link.inertial, fact.inertial_rotation));
+    Link { name: fact.name.clone(), line: fact.line, inertia, shapes, meshes }
 }
 
 /// The one link on no joint, from which every link must be reached.
@@ -430,17 +282,22 @@ fn pose(pose: &urdf_rs::Pose) -> RigidTransform {
     RigidTransform::from_xyz_rpy(Vector3::from(pose.xyz.0), Vector3::from(pose.rpy.0))
 }
 
-fn link_inertia(inertial: &urdf_rs::Inertial) -> LinkInertia {
+/// The pose with the rotation of a quaternion where there is one.
+fn turned(pose: RigidTransform, rotation: Option<Matrix3<f64>>) -> RigidTransform {
+    RigidTransform { rotation: rotation.unwrap_or(pose.rotation), ..pose }
+}
+
+fn link_inertia(inertial: &urdf_rs::Inertial, rotation: Option<Matrix3<f64>>) -> LinkInertia {
     let i = &inertial.inertia;
     let given = Matrix3::new(i.ixx, i.ixy, i.ixz, i.ixy, i.iyy, i.iyz, i.ixz, i.iyz, i.izz);
-    let origin = pose(&inertial.origin);
-    let inertia = if inertial.origin.rpy.0 == [0.0; 3] {
+    let origin = turned(pose(&inertial.origin), rotation);
+    let inertia = if origin.rotation == Matrix3::identity() {
         given
     } else {
         let turned = origin.rotation * given * origin.rotation.transpose();
         (turned + turned.transpose()) * 0.5
     };
-    LinkInertia::new(inertial.mass.value, origin.translation, inertia)
+    without_round_off(LinkInertia::new(inertial.mass.value, origin.translation, inertia))
 }
 
 fn primitive(geometry: &urdf_rs::Geometry) -> Option<Geometry> {

@@ -37,6 +37,8 @@ pub struct Document {
     places: BTreeMap<String, Place>,
     catalogue: Value,
     notes: Vec<String>,
+    /// Keys that were left out because of these.
+    passed_over: Vec<ScenarioError>,
 }
 
 impl Document {
@@ -45,6 +47,14 @@ impl Document {
     /// # Errors
     /// [`ScenarioError::Unreadable`], and those of [`Self::parse`].
     pub fn read(path: impl AsRef<Path>) -> Result<Self, ScenarioError> {
+        Self::lenient(path)?.strict()
+    }
+
+    /// Reads a file past keys that nobody knows and values of another type: [`Self::faults`] has them all.
+    ///
+    /// # Errors
+    /// [`ScenarioError::Unreadable`], [`ScenarioError::Syntax`].
+    pub fn lenient(path: impl AsRef<Path>) -> Result<Self, ScenarioError> {
         let path = path.as_ref();
         let file = path.display().to_string();
         let unreadable = |cause: String| ScenarioError::Unreadable { file: file.clone(), cause };
@@ -56,7 +66,7 @@ impl Document {
             return Err(unreadable(format!("larger than {LARGEST_FILE} bytes")));
         }
         let text = std::fs::read_to_string(path).map_err(|error| unreadable(error.to_string()))?;
-        let mut document = Self::parse(&file, &text)?;
+        let mut document = Self::parse_lenient(&file, &text)?;
         if let Some(stem) = path.file_stem().and_then(|stem| stem.to_str()) {
             let name = Value::String(stem.to_owned());
             document.table.entry("name").or_insert(name);
@@ -69,6 +79,18 @@ impl Document {
     /// # Errors
     /// [`ScenarioError::Syntax`], [`ScenarioError::UnknownKey`], [`ScenarioError::WrongType`].
     pub fn parse(file: &str, text: &str) -> Result<Self, ScenarioError> {
+        Self::parse_lenient(file, text)?.strict()
+    }
+
+    /// As it is where nothing was passed over.
+    fn strict(self) -> Result<Self, ScenarioError> {
+        match self.passed_over.first() {
+            Some(fault) => Err(fault.clone()),
+            None => Ok(self),
+        }
+    }
+
+    fn parse_lenient(file: &str, text: &str) -> Result<Self, ScenarioError> {
         let syntax = |error: toml::de::Error| ScenarioError::Syntax {
             file: file.to_owned(),
             line: line_of(text, error.span().map_or(0, |span| span.start)),
@@ -82,11 +104,13 @@ impl Document {
             places: BTreeMap::new(),
             catalogue,
             notes: Vec::new(),
+            passed_over: Vec::new(),
         };
         document.note_places("", spanned.get_ref(), text);
         let table: Table = toml::from_str(text).map_err(syntax)?;
-        document.table =
-            document.typed("", Value::Table(table), &document.catalogue)?.try_into().map_err(syntax)?;
+        let mut passed_over = Vec::new();
+        document.table = document.typed_table("", table, &document.catalogue, &mut passed_over);
+        document.passed_over = passed_over;
         Ok(document)
     }
 
@@ -193,9 +217,20 @@ impl Document {
     /// The scenario, with defaults filled in and all ranges checked.
     ///
     /// # Errors
-    /// [`ScenarioError::OutOfRange`]; [`ScenarioError::WrongType`] for a word that is none of the allowed ones.
+    /// The first of [`Self::faults`].
     pub fn scenario(&self) -> Result<Scenario, ScenarioError> {
-        let scenario: Scenario = self.table.clone().try_into().map_err(|error: toml::de::Error| {
+        match self.faults().into_iter().next() {
+            Some(fault) => Err(fault),
+            None => self.unchecked(),
+        }
+    }
+
+    /// The scenario with defaults filled in, whatever is wrong with its values.
+    ///
+    /// # Errors
+    /// [`ScenarioError::WrongType`] for a word that is none of the allowed ones.
+    pub fn unchecked(&self) -> Result<Scenario, ScenarioError> {
+        self.table.clone().try_into().map_err(|error: toml::de::Error| {
             let message = error.message().to_owned();
             let (file, place) = (self.file.clone(), Place::Absent);
             ScenarioError::WrongType {
@@ -205,16 +240,27 @@ impl Document {
                 found: message,
                 expected: "?".to_owned(),
             }
-        })?;
-        check(&scenario).map_err(|violation| ScenarioError::OutOfRange {
-            file: self.file.clone(),
-            place: self.place(&violation.key),
-            key: violation.key,
-            value: violation.value,
-            rule: violation.rule,
-            remedy: violation.remedy,
-        })?;
-        Ok(scenario)
+        })
+    }
+
+    /// Everything that is wrong: keys that nobody knows and values of another type, as far as [`Self::lenient`] went past them, then
+    /// [`ScenarioError::OutOfRange`].
+    pub fn faults(&self) -> Vec<ScenarioError> {
+        let mut faults = self.passed_over.clone();
+        match self.unchecked() {
+            Err(error) => faults.push(error),
+            Ok(scenario) => {
+                faults.extend(check(&scenario).into_iter().map(|violation| ScenarioError::OutOfRange {
+                    file: self.file.clone(),
+                    place: self.place(&violation.key),
+                    key: violation.key,
+                    value: violation.value,
+                    rule: violation.rule,
+                    remedy: violation.remedy,
+                }));
+            }
+        }
+        faults
     }
 
     /// The value brought to the types of the catalogue (whole numbers become floating ones where the key is one).
@@ -229,17 +275,10 @@ impl Document {
             })
         };
         match (value, pattern) {
-            (Value::Table(table), Value::Table(known)) => {
-                let mut typed = Table::new();
-                for (name, value) in table {
-                    let inner = join(key, &name);
-                    // One pattern for keys of any name.
-                    let Some(pattern) = known.get(&name).or_else(|| known.get(ANY_NAME)) else {
-                        return Err(self.unknown(key, &inner, &name, known));
-                    };
-                    typed.insert(name, self.typed(&inner, value, pattern)?);
-                }
-                Ok(Value::Table(typed))
+            (Value::Table(table), Value::Table(_)) => {
+                let mut faults = Vec::new();
+                let typed = self.typed_table(key, table, pattern, &mut faults);
+                faults.into_iter().next().map_or(Ok(Value::Table(typed)), Err)
             }
             (Value::Array(list), Value::Table(_)) if LISTS.contains(&key) => {
                 let each = |(index, value)| self.typed(&format!("{key}[{index}]"), value, pattern);
@@ -267,6 +306,39 @@ impl Document {
             (value, pattern) if value.same_type(pattern) => Ok(value),
             (value, pattern) => wrong(&value, expected_type(pattern)),
         }
+    }
+
+    /// As much of a table as the catalogue knows, and what it does not.
+    fn typed_table(
+        &self,
+        key: &str,
+        table: Table,
+        pattern: &Value,
+        faults: &mut Vec<ScenarioError>,
+    ) -> Table {
+        let mut typed = Table::new();
+        let Value::Table(known) = pattern else { return typed };
+        for (name, value) in table {
+            let inner = join(key, &name);
+            // One pattern for keys of any name.
+            let Some(pattern) = known.get(&name).or_else(|| known.get(ANY_NAME)) else {
+                faults.push(self.unknown(key, &inner, &name, known));
+                continue;
+            };
+            match (value, pattern) {
+                (Value::Table(table), Value::Table(_)) => {
+                    let table = self.typed_table(&inner, table, pattern, faults);
+                    typed.insert(name, Value::Table(table));
+                }
+                (value, pattern) => match self.typed(&inner, value, pattern) {
+                    Ok(value) => {
+                        typed.insert(name, value);
+                    }
+                    Err(fault) => faults.push(fault),
+                },
+            }
+        }
+        typed
     }
 
     fn unknown(&self, table: &str, key: &str, name: &str, known: &Table) -> ScenarioError {

@@ -14,6 +14,8 @@ pub struct RobotSettings {
     pub stance: String,
     /// Posture it begins and rests in, by its name in the companion table.
     pub posture: String,
+    /// Whether inertias that no body has are taken as they are, and joints that carry no mass are held; as the key of the companion table.
+    pub accept_impossible_inertia: bool,
     /// How it begins beside that posture.
     pub start: StartSettings,
 }
