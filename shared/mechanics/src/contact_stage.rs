@@ -256,7 +256,7 @@ impl ContactStage {
         self.projection.factor(tree, &self.end, &self.contacts, active, self.regularisation)?;
         self.place_nodes(tree, nominal)?;
         self.solver_factor(tree)?;
-        self.fill_columns(tree);
+        self.fill_columns(tree)?;
         self.solve_saddle(tree, true)?;
         self.end_rows(tree, end)?;
         self.write(nominal, out);

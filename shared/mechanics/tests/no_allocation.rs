@@ -242,3 +242,43 @@ fn warm_batches_of_stages_take_no_memory() {
         });
     }
 }
+
+#[test]
+fn warm_stages_with_contacts_take_no_memory() {
+    use delmpc_mechanics::contact_stage::{BoundaryState, Contact, ContactStage};
+    let tree = quadruped(GRAVITY, Forces::Springs);
+    let mut contacts: Vec<Contact> =
+        (0..4).map(|leg| Contact::point(9 + leg, Vector3::new(0.0, 0.0, -0.25))).collect();
+    contacts.push(Contact::foot(12, Vector3::new(0.0, 0.0, -0.25), Matrix3::identity()));
+    let mut start = BoundaryState::zeros(&tree);
+    start.q[4..8].fill(0.5);
+    start.q[8..].fill(-1.0);
+    start.rate = spread(12, 0.2);
+    let u = spread(12, 0.3);
+    for s in [1, 2, 3] {
+        let rule = LobattoRule::new(s).unwrap();
+        let mut stage = ContactStage::new(&tree, &rule, &contacts).unwrap();
+        let (mut nominal, mut lifted) = (stage.nominal(), stage.lifted());
+        let mut end = start.clone();
+        let (x, force) = (spread(2 * tree.dof(), 1e-3), spread(stage.row_count(), 1.0));
+        for active in [
+            [true, true, true, true, false],
+            [true, false, false, true, false],
+            [false; 5],
+            [true, false, false, false, true],
+        ] {
+            none(&format!("s = {s}, {active:?}"), || {
+                stage.solve(&tree, 0.01, &active, &start, &u, &mut nominal, &mut end).unwrap();
+                stage.linearize(&tree, 0.01, &active, &start, &nominal, &u, &end, &mut lifted).unwrap();
+                nominal.advance(&lifted, &x, &u);
+                nominal.interpolate(&rule, 0.02, &start, &end, &force);
+                stage.linearize(&tree, 0.02, &active, &start, &nominal, &u, &end, &mut lifted).unwrap();
+                end.retract(&x);
+            });
+        }
+        none("refused stage", || {
+            let both = [false, false, false, true, true];
+            assert!(stage.solve(&tree, 0.01, &both, &start, &u, &mut nominal, &mut end).is_err());
+        });
+    }
+}

@@ -364,7 +364,7 @@ impl BoundaryKinematics {
     /// # Errors
     /// [`ModelError`] for wrong lengths or a body that does not exist.
     pub fn static_torques_into(
-        &mut self,
+        &self,
         tree: &KinematicTree,
         q: &[f64],
         contacts: &[Contact],
@@ -402,9 +402,13 @@ impl BoundaryKinematics {
         Ok(self.pose.inverse_transform_wrench(&total))
     }
 
-    /// Derivatives of the momenta by the joint coordinates at fixed spatial twists and rates, `nv x joints` row-major: rows of `P` (in
-    /// base axes about its mass centre) and of `p_j`. With `ε` the momenta in base axes do not change.
-    pub(crate) fn momentum_gradient_into(&self, tree: &KinematicTree, out: &mut [f64]) {
+    /// Derivatives of the momenta by the joint coordinates at fixed `(V_body, q̇)`, `nv x joints` row-major: rows of `P` in base axes
+    /// about its mass centre, and of `p_j`. By `ε` the momenta in base axes do not change.
+    ///
+    /// # Errors
+    /// [`ModelError::Length`] for a wrong slice.
+    pub fn momentum_gradient_into(&self, tree: &KinematicTree, out: &mut [f64]) -> Result<(), ModelError> {
+        check_length("momentum gradient", out.len(), tree.dof() * tree.joint_count())?;
         let joints = tree.joint_count();
         out.fill(0.0);
         let composite = self.composites.composite_inertias_w();
@@ -423,6 +427,7 @@ impl BoundaryKinematics {
                 out[(i + 5) * joints + j - 1] = own.dot(&self.joint_twist_rate_w(j));
             }
         }
+        Ok(())
     }
 }
 

@@ -89,7 +89,7 @@ impl ContactStage {
     pub(super) fn end_rows(&mut self, tree: &KinematicTree, end: &BoundaryState) -> Result<(), StepError> {
         let nv = tree.dof();
         self.ends.reshape(2 * nv, self.map_columns());
-        self.end.momentum_gradient_into(tree, &mut self.momentum_gradient);
+        self.end.momentum_gradient_into(tree, &mut self.momentum_gradient)?;
         let frame = self.end_frame();
         self.fill_end_of_nodes(tree, &frame);
         let instructions = self.del.instructions;
@@ -106,8 +106,8 @@ impl ContactStage {
             target: &mut self.ends,
             first: nv,
         });
-        self.add_direct_terms(tree, &frame);
-        self.add_defect(tree, &frame, end);
+        self.add_direct_terms(tree, &frame)?;
+        self.add_defect(tree, &frame, end)?;
         instructions.dispatch_wide(SolveMass { factor: self.end.factor(), out: &mut self.ends });
         self.project_end(tree)
     }
@@ -223,9 +223,9 @@ impl ContactStage {
     }
 
     /// What `x` and `u` do to the end at fixed nodes and multipliers.
-    fn add_direct_terms(&mut self, tree: &KinematicTree, frame: &EndFrame) {
+    fn add_direct_terms(&mut self, tree: &KinematicTree, frame: &EndFrame) -> Result<(), StepError> {
         let Self { del, solver, ends, start, momentum_gradient, relatives, .. } = self;
-        let Some(hessian) = solver.hessian() else { return };
+        let Some(hessian) = solver.hessian() else { return Ok(()) };
         let (nv, s) = (tree.dof(), del.unknown_nodes());
         let joints = nv - 6;
         let to_base = frame.pose.adjoint().transpose();
@@ -257,7 +257,7 @@ impl ContactStage {
                 ends.add(nv + k, 1 + nv + column, moved[k]);
             }
         }
-        start.momentum_gradient_into(tree, momentum_gradient);
+        start.momentum_gradient_into(tree, momentum_gradient)?;
         for joint in 0..joints {
             let dof = 6 + joint;
             let moved = carry * Vector6::from_fn(|r, _| momentum_gradient[r * joints + joint]);
@@ -279,10 +279,16 @@ impl ContactStage {
             let step = del.rule.weights()[s] * del.time_step;
             ends.add(nv + dof, 1 + 2 * nv + joint, step);
         }
+        Ok(())
     }
 
     /// Distance of the end from the next boundary state.
-    fn add_defect(&mut self, tree: &KinematicTree, frame: &EndFrame, end: &BoundaryState) {
+    fn add_defect(
+        &mut self,
+        tree: &KinematicTree,
+        frame: &EndFrame,
+        end: &BoundaryState,
+    ) -> Result<(), StepError> {
         let (nv, s) = (tree.dof(), self.del.unknown_nodes());
         let joints = nv - 6;
         let turn = log_rotation(&end.orientation.tr_mul(&frame.pose.rotation));
@@ -293,7 +299,7 @@ impl ContactStage {
             self.ends.add(k, 0, turn[k]);
             self.ends.add(3 + k, 0, travel[k]);
         }
-        self.end.momentum_gradient_into(tree, &mut self.momentum_gradient);
+        self.end.momentum_gradient_into(tree, &mut self.momentum_gradient)?;
         for k in 0..6 {
             self.ends.add(nv + k, 0, momentum[k]);
         }
@@ -311,6 +317,7 @@ impl ContactStage {
                 }
             }
         }
+        Ok(())
     }
 
     /// `δλ^s`, and the velocities after it.

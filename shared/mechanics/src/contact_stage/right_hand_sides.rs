@@ -14,6 +14,7 @@ use nalgebra::{Matrix6, Vector6};
 
 use super::ContactStage;
 use crate::del_residual::DelWorkspace;
+use crate::errors::ModelError;
 use crate::lanes::LANES;
 use crate::newton_direction::{NewtonDirection, base_matrix};
 use crate::spatial::{Twist, Wrench};
@@ -21,7 +22,7 @@ use crate::tree::KinematicTree;
 
 impl ContactStage {
     /// `-[r | R_x | R_u]`, then `𝒜`.
-    pub(super) fn fill_columns(&mut self, tree: &KinematicTree) {
+    pub(super) fn fill_columns(&mut self, tree: &KinematicTree) -> Result<(), ModelError> {
         let (nv, s) = (tree.dof(), self.del.unknown_nodes());
         let first = self.map_columns();
         self.columns.reshape(s * nv, first + s * self.active.len());
@@ -30,7 +31,7 @@ impl ContactStage {
         }
         self.fill_pose_columns(tree);
         self.fill_joint_columns(tree);
-        self.fill_momentum_columns(tree);
+        self.fill_momentum_columns(tree)?;
         for joint in 0..nv - 6 {
             for alpha in 0..s {
                 let step = self.del.rule.weights()[alpha] * self.del.time_step;
@@ -38,6 +39,7 @@ impl ContactStage {
             }
         }
         self.fill_force_columns(tree, first);
+        Ok(())
     }
 
     /// Only `-r` and `𝒜`: a Newton iteration.
@@ -99,10 +101,10 @@ impl ContactStage {
     }
 
     /// The momenta at the start: by `q` at fixed velocity, and by the velocity.
-    fn fill_momentum_columns(&mut self, tree: &KinematicTree) {
+    fn fill_momentum_columns(&mut self, tree: &KinematicTree) -> Result<(), ModelError> {
         let Self { del, columns, start, momentum_gradient, .. } = self;
         let (nv, s) = (tree.dof(), del.unknown_nodes());
-        start.momentum_gradient_into(tree, momentum_gradient);
+        start.momentum_gradient_into(tree, momentum_gradient)?;
         let on_base = base_momentum_rows(del);
         let joints = nv - 6;
         let mass = start.mass_matrix();
@@ -132,6 +134,7 @@ impl ContactStage {
                 }
             }
         }
+        Ok(())
     }
 
     fn fill_force_columns(&mut self, tree: &KinematicTree, first: usize) {
