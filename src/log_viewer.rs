@@ -52,7 +52,7 @@ impl LogViewer {
     /// For the robot and the ball of a setup.
     pub fn new(setup: &Setup) -> Self {
         let robot = &setup.robot;
-        let sole = robot.sole(&setup.scenario.robot.stance).and_then(|sole| robot.frame(&sole.frame));
+        let sole = robot.sole(setup.scenario.robot.stance.first()).and_then(|sole| robot.frame(&sole.frame));
         Self {
             tree: robot.tree.clone(),
             names: robot.body_names.clone(),

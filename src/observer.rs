@@ -42,7 +42,7 @@ impl Observer {
     pub fn new(setup: &Setup) -> Result<Self, Failure> {
         let (robot, scenario) = (&setup.robot, &setup.scenario);
         let missing = || Failure::Input(format!("`robot.stance`: {} is on no link", scenario.robot.stance));
-        let sole = robot.sole(&scenario.robot.stance).ok_or_else(missing)?;
+        let sole = robot.sole(scenario.robot.stance.first()).ok_or_else(missing)?;
         Ok(Self {
             tree: robot.tree.clone(),
             kinematics: Kinematics::new(&robot.tree),

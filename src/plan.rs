@@ -151,8 +151,11 @@ fn task_of(
         .map(|spring| (spring.joint.as_str(), spring.stiffness_nm_per_rad, spring.rest_rad))
         .collect();
     let reaches = !settings.hand.is_empty();
-    let robot =
-        if reaches { PlanRobot::standing(&model, &scenario.robot.stance)? } else { PlanRobot::new(&model)? };
+    let robot = if reaches {
+        PlanRobot::standing(&model, scenario.robot.stance.first())?
+    } else {
+        PlanRobot::new(&model)?
+    };
     let robot = robot.with_springs(&springs)?;
     let standing = if reaches { Some(standing_of(&model, scenario, settings)) } else { None };
     let reach = if reaches { Some((robot.frame(&settings.hand)?.clone(), settings.target_m)) } else { None };
@@ -195,7 +198,7 @@ fn task_of(
 
 /// The sole's bounding box less the margin.
 fn standing_of(model: &delmpc_robots::RobotModel, scenario: &Scenario, settings: &PlanSettings) -> Standing {
-    let polygon = model.sole(&scenario.robot.stance).map_or(&[][..], |sole| sole.polygon.as_slice());
+    let polygon = model.sole(scenario.robot.stance.first()).map_or(&[][..], |sole| sole.polygon.as_slice());
     let range = |axis: usize| {
         let values = polygon.iter().map(|corner| corner[axis]);
         let (low, high) =
@@ -203,7 +206,7 @@ fn standing_of(model: &delmpc_robots::RobotModel, scenario: &Scenario, settings:
         [low + settings.cop_margin_m, high - settings.cop_margin_m]
     };
     Standing {
-        sole: scenario.robot.stance.clone(),
+        sole: scenario.robot.stance.first().to_owned(),
         pressure_m: [range(0), range(1)],
         yaw_arm_m: settings.yaw_arm_m,
     }

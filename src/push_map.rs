@@ -306,7 +306,7 @@ fn capture_limit(setup: &Setup, angle_rad: f64) -> f64 {
     let limit = || {
         let robot = &setup.robot;
         let posture = robot.posture(&setup.scenario.robot.posture)?;
-        let sole = robot.sole(&setup.scenario.robot.stance)?;
+        let sole = robot.sole(setup.scenario.robot.stance.first())?;
         let rooted = robot.rooted_at(&sole.frame).ok()?;
         let tree = &rooted.model.tree;
         let mut kinematics = Kinematics::new(tree);

@@ -2,6 +2,7 @@
 
 use delmpc_controller_core::config::{ConstraintConfig, ControllerConfig};
 use delmpc_controller_core::cycle::Clock as CycleClock;
+use delmpc_controller_core::legged::LeggedController;
 use delmpc_controller_core::prelude as core;
 use delmpc_controller_core::prelude::{BodyPoint, ControllerModel, JointLimits, Reach, Sensing, TaskWeights};
 use delmpc_controller_process::clock::monotonic_ns;
@@ -12,14 +13,22 @@ use delmpc_messages::{Command, PlantState};
 use delmpc_robots::RobotModel;
 use delmpc_scenario::{Clock, ControllerKind, Scenario};
 
+use crate::legged_robot;
 use crate::setup::Setup;
 use crate::verdict::Failure;
 
 /// The cycle, and what times its steps.
 #[derive(Debug)]
 pub struct RobotController<K = RunClock> {
-    controller: core::Controller,
+    cycle: Cycle,
     clock: K,
+}
+
+/// The cycle of a robot on one foot, or on any set of feet.
+#[derive(Debug)]
+enum Cycle {
+    OneFoot(Box<core::Controller>),
+    Legged(Box<LeggedController>),
 }
 
 /// The clock of an ordinary run.
@@ -62,21 +71,47 @@ impl<K> RobotController<K> {
     pub fn with_clock(setup: &Setup, clock: K) -> Result<Self, Failure> {
         let refused =
             |error: &dyn std::fmt::Display| Failure::Input(format!("{}: {error}", setup.scenario.name));
+        if setup.is_legged() {
+            let robot = legged_robot::robot(setup).map_err(|error| refused(&error))?;
+            let config = legged_robot::config(setup, &robot.model).map_err(|error| refused(&error))?;
+            let controller = LeggedController::new(robot, config).map_err(|error| refused(&error))?;
+            return Ok(Self { cycle: Cycle::Legged(Box::new(controller)), clock });
+        }
         let model = model(setup).map_err(|error| refused(&error))?;
         let mut controller =
             core::Controller::new(model, config(&setup.scenario)).map_err(|error| refused(&error))?;
         controller.set_origin_ns(0);
-        Ok(Self { controller, clock })
+        Ok(Self { cycle: Cycle::OneFoot(Box::new(controller)), clock })
     }
 
     /// How far from the ball the hand is in the posture in which the reach ends, m: not 0 when the ball cannot be reached in balance.
     pub fn out_of_reach_m(&self) -> Option<f64> {
-        self.controller.reference().reach.as_ref().map(|_| self.controller.hand_distance_left_m())
+        let controller = self.one_foot()?;
+        controller.reference().reach.as_ref().map(|_| controller.hand_distance_left_m())
     }
 
-    /// The controller itself: its plan, its model, its problem.
-    pub fn core(&self) -> &core::Controller {
-        &self.controller
+    /// The controller of a robot on one foot: its plan, its model, its problem.
+    pub fn one_foot(&self) -> Option<&core::Controller> {
+        match &self.cycle {
+            Cycle::OneFoot(controller) => Some(controller),
+            Cycle::Legged(_) => None,
+        }
+    }
+
+    /// The controller of a robot on any set of feet.
+    pub fn legged(&self) -> Option<&LeggedController> {
+        match &self.cycle {
+            Cycle::OneFoot(_) => None,
+            Cycle::Legged(controller) => Some(controller),
+        }
+    }
+
+    /// The command of the last cycle.
+    pub fn command(&self) -> &Command {
+        match &self.cycle {
+            Cycle::OneFoot(controller) => controller.command(),
+            Cycle::Legged(controller) => controller.command(),
+        }
     }
 
     /// What timed the steps.
@@ -88,13 +123,18 @@ impl<K> RobotController<K> {
 impl<K: CycleClock> Controller for RobotController<K> {
     fn cycle(&mut self, state: &PlantState, now_ns: u64, command: &mut Command) {
         let (header, publish_ns) = (command.header, command.report.publish_ns);
-        *command = *self.controller.cycle(state, now_ns, &self.clock);
+        *command = match &mut self.cycle {
+            Cycle::OneFoot(controller) => *controller.cycle(state, now_ns, &self.clock),
+            Cycle::Legged(controller) => *controller.cycle(state, now_ns, &self.clock),
+        };
         command.header = header;
         command.report.publish_ns = publish_ns;
     }
 
     fn prepare(&mut self) {
-        self.controller.prepare(&self.clock);
+        if let Cycle::OneFoot(controller) = &mut self.cycle {
+            controller.prepare(&self.clock);
+        }
     }
 }
 
@@ -104,8 +144,8 @@ fn model(setup: &Setup) -> Result<ControllerModel, String> {
     let rooted = robot.rooted_at(setup.stance_frame()).map_err(|error| error.to_string())?;
     let standing = &rooted.model;
     let posture = standing.posture(&scenario.robot.posture).ok_or("the posture is missing")?;
-    let sole = standing.sole(&scenario.robot.stance).ok_or("the sole is missing")?;
-    let other = standing.soles.iter().find(|sole| sole.name != scenario.robot.stance);
+    let sole = standing.sole(scenario.robot.stance.first()).ok_or("the sole is missing")?;
+    let other = standing.soles.iter().find(|sole| sole.name != scenario.robot.stance.first());
     Ok(ControllerModel {
         tree: standing.tree.clone(),
         message_joint: ControllerModel::message_joints(&rooted.rerooted),
@@ -130,7 +170,17 @@ fn model(setup: &Setup) -> Result<ControllerModel, String> {
 
 /// What the robot feels of its base and feet.
 fn sensing(setup: &Setup, rerooted: Rerooted) -> Result<Sensing, String> {
-    let (robot, scenario) = (&setup.robot, &setup.scenario);
+    let stance_foot = setup.stance_foot();
+    let (estimator, config) = (estimator_model(setup)?, estimator_config(&setup.scenario));
+    Ok(Sensing { estimator, config, stance_foot, rerooted })
+}
+
+/// The robot as the estimator has it, its feet in the order of the messages.
+///
+/// # Errors
+/// In words: a sole or an inertial unit on no link.
+pub fn estimator_model(setup: &Setup) -> Result<EstimatorModel, String> {
+    let robot = &setup.robot;
     let feet: Vec<FootModel> = robot
         .soles
         .iter()
@@ -142,34 +192,32 @@ fn sensing(setup: &Setup, rerooted: Rerooted) -> Result<Sensing, String> {
             Ok(FootModel { body, sole: sole_pose, polygon })
         })
         .collect::<Result<_, String>>()?;
-    let stance_foot = robot.soles.iter().position(|sole| sole.name == scenario.robot.stance).unwrap_or(0);
     let (imu_body, imu_mounting) = setup.inertial_unit()?;
+    Ok(EstimatorModel {
+        imu_body,
+        imu_mounting,
+        reference_foot: setup.stance_foot(),
+        ..EstimatorModel::new(robot.tree.clone(), feet)
+    })
+}
+
+/// How good the sensors are.
+pub fn estimator_config(scenario: &Scenario) -> EstimatorConfig {
     let s = &scenario.sensors;
     // Never better than a good sensor, however little noise the scenario has.
     let scaled = |value: f64, least: f64| (s.noise_scale * value).max(least);
-    let default = EstimatorConfig::default();
-    Ok(Sensing {
-        estimator: EstimatorModel {
-            imu_body,
-            imu_mounting,
-            reference_foot: stance_foot,
-            ..EstimatorModel::new(robot.tree.clone(), feet)
-        },
-        config: EstimatorConfig {
-            sample_s: scenario.plant.step_s,
-            gyro_noise: scaled(s.gyro_noise_rad_s, 1e-4),
-            gyro_bias: scaled(s.gyro_bias_rad_s, 1e-3),
-            gyro_bias_walk: scaled(s.gyro_bias_walk_rad_s, 1e-6),
-            accelerometer_noise: scaled(s.accelerometer_noise_m_s2, 1e-3),
-            accelerometer_bias: scaled(s.accelerometer_bias_m_s2, 1e-3),
-            accelerometer_bias_walk: scaled(s.accelerometer_bias_walk_m_s2, 1e-5),
-            position_noise: scaled(s.position_noise_rad.max(0.3 * s.position_resolution_rad), 1e-6),
-            velocity_noise: scaled(s.velocity_noise_rad_s.max(0.3 * s.velocity_resolution_rad_s), 1e-4),
-            ..default
-        },
-        stance_foot,
-        rerooted,
-    })
+    EstimatorConfig {
+        sample_s: scenario.plant.step_s,
+        gyro_noise: scaled(s.gyro_noise_rad_s, 1e-4),
+        gyro_bias: scaled(s.gyro_bias_rad_s, 1e-3),
+        gyro_bias_walk: scaled(s.gyro_bias_walk_rad_s, 1e-6),
+        accelerometer_noise: scaled(s.accelerometer_noise_m_s2, 1e-3),
+        accelerometer_bias: scaled(s.accelerometer_bias_m_s2, 1e-3),
+        accelerometer_bias_walk: scaled(s.accelerometer_bias_walk_m_s2, 1e-5),
+        position_noise: scaled(s.position_noise_rad.max(0.3 * s.position_resolution_rad), 1e-6),
+        velocity_noise: scaled(s.velocity_noise_rad_s.max(0.3 * s.velocity_resolution_rad_s), 1e-4),
+        ..EstimatorConfig::default()
+    }
 }
 
 /// A frame's origin as a point of its body; `None` when it is fixed to the ground.

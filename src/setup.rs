@@ -6,7 +6,7 @@ use delmpc_controller_core::config::ControllerConfig;
 use delmpc_mechanics::prelude::RigidTransform;
 use delmpc_messages::{JointSetHasher, MAX_JOINTS, joint_set_hash};
 use delmpc_robots::{ImpossibleInertia, LoadOptions, RobotModel, load_with};
-use delmpc_scenario::{Document, Scenario};
+use delmpc_scenario::{Document, Scenario, Stance};
 
 use crate::check::Findings;
 use crate::start::Start;
@@ -72,7 +72,8 @@ impl Setup {
         findings.warnings.extend(robot.warnings.iter().cloned());
         let clamped = crate::check::clamp_efforts(&mut robot);
         findings.warnings.extend(clamped.into_iter().map(|warning| format!("{}: {warning}", urdf.display())));
-        let setup = Self { scenario, robot, urdf, notes: document.notes().to_vec() };
+        let mut setup = Self { scenario, robot, urdf, notes: document.notes().to_vec() };
+        setup.name_all_soles();
         let of_file = |fault: String| format!("{}: {fault}", file.display());
         let mut wrong = setup.check_names();
         match crate::stance::check_scenario(&setup) {
@@ -129,9 +130,23 @@ impl Setup {
         Ok(self.scenario.reach.as_ref().map(|reach| to_w(reach.ball_m)))
     }
 
-    /// Index of the stance foot among the soles of the robot.
+    /// `robot.stance` = "all" by the names of the robot's soles.
+    fn name_all_soles(&mut self) {
+        if self.scenario.robot.stance.is_all() {
+            let names = self.robot.soles.iter().map(|sole| sole.name.clone()).collect();
+            self.scenario.robot.stance = Stance::Some(names);
+        }
+    }
+
+    /// Whether the robot stands on several feet, or goes: then its controller has a contact schedule.
+    pub fn is_legged(&self) -> bool {
+        let scenario = &self.scenario;
+        scenario.robot.stance.names().len() > 1 || scenario.gait.is_some() || !scenario.step.is_empty()
+    }
+
+    /// Index of the (first) stance foot among the soles of the robot.
     pub fn stance_foot(&self) -> usize {
-        self.robot.soles.iter().position(|sole| sole.name == self.scenario.robot.stance).unwrap_or(0)
+        self.robot.soles.iter().position(|sole| sole.name == self.scenario.robot.stance.first()).unwrap_or(0)
     }
 
     /// Body and mounting of the inertial unit as everybody believes it to be.
@@ -151,7 +166,7 @@ impl Setup {
 
     /// The frame of the sole the robot stands on.
     pub fn stance_frame(&self) -> &str {
-        self.robot.sole(&self.scenario.robot.stance).map_or("", |sole| sole.frame.as_str())
+        self.robot.sole(self.scenario.robot.stance.first()).map_or("", |sole| sole.frame.as_str())
     }
 
     /// Keys that fit alone may not fit together.
@@ -206,8 +221,13 @@ impl Setup {
                 wrong.push(format!("`{key}` = \"{name}\": the robot has no such {kind}; it has {known}"));
             }
         };
-        let soles = robot.soles.iter().map(|sole| sole.name.as_str()).collect();
-        one_of("robot.stance", "sole", &scenario.robot.stance, soles);
+        let soles: Vec<&str> = robot.soles.iter().map(|sole| sole.name.as_str()).collect();
+        for name in scenario.robot.stance.names() {
+            one_of("robot.stance", "sole", name, soles.clone());
+        }
+        for (index, step) in scenario.step.iter().enumerate() {
+            one_of(&format!("step[{index}].foot"), "sole", &step.foot, soles.clone());
+        }
         let postures = robot.postures.iter().map(|posture| posture.name.as_str()).collect();
         one_of("robot.posture", "posture", &scenario.robot.posture, postures);
         let links: Vec<&str> = robot.links.iter().map(|link| link.name.as_str()).collect();

@@ -15,6 +15,7 @@ use delmpc_robots::{Geometry, RobotModel, ShapeRole};
 use delmpc_scenario::{Clock, PushSettings, Scenario};
 use nalgebra::Vector3;
 
+use crate::legged_robot;
 use crate::observer::{Motion, Observer};
 use crate::plant_process::Plant;
 use crate::setup::Setup;
@@ -177,7 +178,9 @@ impl Holding {
         };
         let period = setup.scenario.plant.step_s;
         let gains = HoldingGains::new(&robot.tree, state, &floating(&inertia)?, period);
-        Ok(Self { torque: floating(&gravity)?, gains: gains.map_err(|error| error.to_string())? })
+        let torque =
+            if setup.is_legged() { legged_robot::holding_torque(setup)? } else { floating(&gravity)? };
+        Ok(Self { torque, gains: gains.map_err(|error| error.to_string())? })
     }
 }
 
@@ -185,9 +188,8 @@ fn model(setup: &Setup) -> Result<PlantModel, Failure> {
     let (robot, scenario) = (&setup.robot, &setup.scenario);
     let contacts = robot.contacts.iter().map(|contact| {
         let body = contact.body.ok_or_else(|| on_no_body(&contact.name))?;
-        // A small sphere touches flat ground below its centre.
-        let point = contact.position - contact.radius * Vector3::z();
-        Ok(ContactPoint { body, point, friction: scenario.plant.friction })
+        let (point, radius, friction) = (contact.position, contact.radius, scenario.plant.friction);
+        Ok(ContactPoint { body, point, radius, friction })
     });
     let mut contacts = contacts.collect::<Result<Vec<_>, Failure>>()?;
     contacts.extend(body_contacts(setup));
@@ -238,7 +240,8 @@ fn body_contacts(setup: &Setup) -> Vec<ContactPoint> {
                 at.x *= std::f64::consts::FRAC_1_SQRT_2;
                 at.y *= std::f64::consts::FRAC_1_SQRT_2;
             }
-            points.push(ContactPoint { body, point: shape.attachment.pose.transform_point(&at), friction });
+            let point = shape.attachment.pose.transform_point(&at);
+            points.push(ContactPoint { body, point, radius: 0.0, friction });
         }
     }
     points
@@ -251,7 +254,7 @@ fn config(setup: &Setup, holding: &Holding, start: &Start) -> Result<PlantConfig
         true => ActuatorLimits { effort: limit.effort, velocity: limit.velocity, ..ActuatorLimits::NONE },
         false => ActuatorLimits::NONE,
     });
-    let stance = robot.soles.iter().position(|sole| sole.name == scenario.robot.stance);
+    let stance = robot.soles.iter().position(|sole| sole.name == scenario.robot.stance.first());
     let pushes = scenario.push.iter().filter(|push| push.impulse_ns > 0.0);
     Ok(PlantConfig {
         time_step: plant.step_s,
@@ -306,7 +309,8 @@ fn ground(setup: &Setup) -> GroundGive {
         return GroundGive::RIGID;
     }
     let mass = robot.tree.total_mass() * scenario.plant.mass_scale;
-    let points = robot.sole(&scenario.robot.stance).map_or(1, |sole| sole.contacts.len().max(1)) as f64;
+    let standing = scenario.robot.stance.names().iter().filter_map(|name| robot.sole(name));
+    let points = standing.map(|sole| sole.contacts.len()).sum::<usize>().max(1) as f64;
     let stiffness = mass * robot.tree.gravity_w().norm() / (sink * points);
     let critical = 2.0 * (stiffness * mass / points).sqrt();
     GroundGive { stiffness, damping: scenario.plant.ground_damping_ratio * critical }

@@ -124,17 +124,21 @@ pub fn check_scenario(setup: &Setup) -> Result<Vec<String>, String> {
     let soles = soles_in(robot, posture, base).map_err(in_words)?;
     let standing: Vec<&Stance> = soles.iter().filter(|stance| stance.stands()).collect();
     let names = || standing.iter().map(|stance| stance.sole.name.as_str()).collect::<Vec<_>>().join(" and ");
+    let asked = scenario.robot.stance.names();
+    if setup.is_legged() {
+        return check_feet(&soles, asked);
+    }
     if standing.len() > 1 {
         return Err(format!(
-            "`robot.posture` = \"{}\": the robot stands on {}, and this controller balances on one sole: take a posture in which only \
-             `robot.stance` = \"{}\" is on the ground",
+            "`robot.posture` = \"{}\": the robot stands on {}, and `robot.stance` = \"{}\" names one: take a posture in which only it is on the ground, \
+             or name all of them, robot.stance = [...] or \"all\"",
             posture.name,
             names(),
             scenario.robot.stance
         ));
     }
     let mut warnings = Vec::new();
-    let stance = soles.iter().find(|stance| stance.sole.name == scenario.robot.stance);
+    let stance = soles.iter().find(|stance| stance.sole.name == scenario.robot.stance.first());
     if let Some(stance) = stance {
         if !stance.stands() {
             warnings.push(no_sole_stands(stance));
@@ -145,6 +149,19 @@ pub fn check_scenario(setup: &Setup) -> Result<Vec<String>, String> {
         warnings.extend(holding(robot, posture, stance.sole).map_err(in_words)?.warning);
     }
     Ok(warnings)
+}
+
+/// What is to be said of a robot on several feet.
+fn check_feet(soles: &[Stance<'_>], asked: &[String]) -> Result<Vec<String>, String> {
+    let names: Vec<&str> = soles.iter().map(|stance| stance.sole.name.as_str()).collect();
+    if let Some(missing) = names.iter().find(|name| !asked.iter().any(|asked| asked == *name)) {
+        return Err(format!(
+            "`robot.stance`: a robot on several feet, or on its way, begins on all of them, and {missing} is not named: \
+             robot.stance = \"all\""
+        ));
+    }
+    let off = soles.iter().filter(|stance| stance.height_m.abs() > ON_GROUND_M);
+    Ok(off.map(no_sole_stands).collect())
 }
 
 /// Every sole in a posture.

@@ -41,7 +41,7 @@ impl StatusLine {
             let commands = node.subscriber(Channel::Command).ok()?;
             Some(Links { states, commands })
         };
-        let polygon = setup.robot.sole(&setup.scenario.robot.stance).map(|sole| sole.polygon.clone());
+        let polygon = setup.robot.sole(setup.scenario.robot.stance.first()).map(|sole| sole.polygon.clone());
         Self {
             links: connect(),
             polygon: polygon.unwrap_or_default(),

@@ -113,7 +113,7 @@ impl Controller for TapedController {
     fn prepare(&mut self) {
         self.controller.prepare();
         // Not before the command is sent: its four thousand words take microseconds.
-        self.input.command = checksum(self.controller.core().command());
+        self.input.command = checksum(self.controller.command());
         self.inputs.keep(*self.input);
     }
 }

@@ -153,7 +153,7 @@ fn compare(cycles: usize, stride: usize) -> Findings {
         if cycle == 0 || cycle % stride != 0 {
             return;
         }
-        let core = controller.core();
+        let core = controller.one_foot().unwrap();
         let (problem, plan) = (core.problem(), core.solution());
         let torque = core.plan().unwrap().values.u(0);
         let multipliers: Vec<(RowId, f64)> =

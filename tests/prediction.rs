@@ -78,7 +78,7 @@ fn the_plan_says_where_the_plant_will_be() {
         plant.step().unwrap();
     }
 
-    let model = controller.core().model();
+    let model = controller.one_foot().unwrap().model();
     let at = |time_ns: u64| history.iter().position(|truth| truth.time_ns == time_ns);
     let (mut checked, mut worst_q, mut worst_state, mut worst_wrench) = (0, 0.0_f64, 0.0_f64, 0.0_f64);
     let mut wrench_scale = [0.0_f64; 2];
@@ -120,7 +120,7 @@ fn the_plan_says_where_the_plant_will_be() {
 
 /// The first stage of the last plan.
 fn first_stage(controller: &RobotController) -> Prediction {
-    let controller = controller.core();
+    let controller = controller.one_foot().unwrap();
     let tree = &controller.model().tree;
     let plan = controller.plan().unwrap();
     let ns = |s: f64| (s * 1e9).round() as u64;

@@ -208,6 +208,7 @@ impl ContactStep {
         } else {
             self.start.update(tree, state)?;
         }
+        self.roll_spheres(tree);
         self.find_candidates();
         self.load_impulses();
         self.set_forces(pushes);
@@ -324,6 +325,18 @@ impl ContactStep {
             wrench += Wrench::new(result.mean_point_w.cross(&force), force);
         }
         wrench
+    }
+
+    /// The points of spheres that touch.
+    fn roll_spheres(&mut self, tree: &KinematicTree) {
+        let down = -self.terrain.normal_w();
+        for (point, contact) in self.points.iter_mut().zip(&self.contacts) {
+            if contact.radius > 0.0 {
+                let link = self.start.kinematics().link_poses_w()[contact.body].rotation;
+                let lowest = contact.point + link.tr_mul(&down) * contact.radius;
+                point.point_b = lowest - tree.bodies()[contact.body].inertia.com;
+            }
+        }
     }
 
     fn find_candidates(&mut self) {

@@ -21,7 +21,7 @@
 //! // A ball of 1 kg falls on the ground.
 //! let ball = LinkInertia::new(1.0, Vector3::zeros(), Matrix3::identity() * 0.01);
 //! let tree = TreeBuilder::floating_base(Vector3::new(0.0, 0.0, -9.81), ball).build()?;
-//! let lowest = ContactPoint { body: 0, point: Vector3::new(0.0, 0.0, -0.1), friction: 0.5 };
+//! let lowest = ContactPoint { body: 0, point: Vector3::new(0.0, 0.0, -0.1), radius: 0.0, friction: 0.5 };
 //! let model = PlantModel { contacts: vec![lowest], feet: vec![], joint_set_hash: 0, tree };
 //! let mut state = State::zeros(&model.tree);
 //! state.base_pose.translation.z = 0.3;

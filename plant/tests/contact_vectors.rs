@@ -33,6 +33,7 @@ impl Case {
         let contacts = json["contacts"].as_array().unwrap().iter().map(|contact| ContactPoint {
             body: contact["body"].as_u64().unwrap() as usize - 1,
             point: vector3(&contact["point"]),
+            radius: 0.0,
             friction: contact["mu"].as_f64().unwrap(),
         });
         let mut state = State::zeros(&tree);

@@ -56,7 +56,7 @@ fn rooted_leg(stiffness: f64) -> KinematicTree {
 }
 
 fn sole(friction: f64) -> Vec<ContactPoint> {
-    let corner = |x, y| ContactPoint { body: 0, point: Vector3::new(x, y, 0.0), friction };
+    let corner = |x, y| ContactPoint { body: 0, point: Vector3::new(x, y, 0.0), radius: 0.0, friction };
     vec![corner(-0.08, -0.05), corner(-0.08, 0.05), corner(0.16, -0.05), corner(0.16, 0.05)]
 }
 

@@ -49,7 +49,7 @@ pub fn page(setup: &Setup, recording: &Recording, summary: &Value) -> Result<Str
 /// What a page knows of a run before it begins: robot, scenario, events.
 pub fn description(setup: &Setup) -> Value {
     let Setup { scenario, robot, .. } = setup;
-    let stance = robot.soles.iter().position(|sole| sole.name == scenario.robot.stance);
+    let stance = robot.soles.iter().position(|sole| sole.name == scenario.robot.stance.first());
     let hand = scenario.reach.as_ref().and_then(|reach| robot.frame(&reach.hand));
     json!({
         "scenario": scenario.name,

@@ -30,7 +30,7 @@ pub fn all(setup: &Setup, recording: &Recording) -> Result<Vec<(&'static str, Ca
         ("torque.png", torques(setup, recording)?),
         ("constraints.png", constraints(setup, recording)?),
     ];
-    let stance = setup.robot.sole(&setup.scenario.robot.stance);
+    let stance = setup.robot.sole(setup.scenario.robot.stance.first());
     if let Some(sole) = stance {
         let polygon: Vec<[f64; 2]> = sole.polygon.iter().map(|corner| (*corner).into()).collect();
         list.push(("pressure_x.png", pressure(setup, recording, &polygon, 0)?));
@@ -332,7 +332,7 @@ fn sole_from_above(
     let [right, bottom] = [width - ROOM, HEIGHT - 26.0];
     canvas.line([[right - 0.05 * scale, bottom], [right, bottom]], SOFT, 3.0, None);
     canvas.text([right - 0.05 * scale - 12.0, bottom], Align::Right, Text::Small, "50 mm", SOFT);
-    canvas.text([ROOM, bottom], Align::Left, Text::Small, &setup.scenario.robot.stance, SOFT);
+    canvas.text([ROOM, bottom], Align::Left, Text::Small, setup.scenario.robot.stance.first(), SOFT);
     canvas.disc(at([0.0, 0.0]), 4.0, SOFT);
     Ok(canvas)
 }

@@ -47,7 +47,7 @@ impl Feed {
             let force = direction_w * (push.impulse_ns / push.duration_s);
             (force, push.start_s, push.start_s + push.duration_s)
         });
-        let polygon = setup.robot.sole(&setup.scenario.robot.stance).map(|sole| sole.polygon.clone());
+        let polygon = setup.robot.sole(setup.scenario.robot.stance.first()).map(|sole| sole.polygon.clone());
         Ok(Self {
             states: node.subscriber(Channel::State).map_err(Failure::fault)?,
             commands: node.subscriber(Channel::Command).map_err(Failure::fault)?,

@@ -26,7 +26,7 @@ use delmpc_horizon::motion_plan::MotionPlan;
 use delmpc_horizon::motion_reference::{MotionReference, SwingShape};
 use delmpc_horizon::retiming::retime;
 use delmpc_horizon::stage_grid::StageGrid;
-use delmpc_horizon::step_plan::{StraightWalk, lay_out, mass_centre_over};
+use delmpc_horizon::step_plan::{Step, lay_out, mass_centre_over};
 use delmpc_lq::dual_qp::QpSolver;
 use delmpc_lq::kernels::largest;
 use delmpc_lq::projected_qp::{ProjectedQp, ProjectedQpOptions, ProjectedQpReport, default_backend};
@@ -68,8 +68,8 @@ pub enum Motion {
     Stand,
     /// Go by a gait.
     Gait(GaitCommand),
-    /// Go by single steps, on two feet.
-    Steps(StraightWalk),
+    /// Go by single steps, in the order of time.
+    Steps(Vec<Step>),
 }
 
 /// A gait and the way.
@@ -344,17 +344,13 @@ impl LeggedController {
                 };
                 self.walk = Some(GaitWalk::new(command.gait.clone(), aim.path, &places));
             }
-            Motion::Steps(walk) => {
-                let [first, second] = places[..] else {
-                    return Err(ControlError::Model { reason: "single steps need a robot of two feet" });
-                };
-                let steps = walk.steps(&[first, second]);
-                if !lay_out(&steps, &mut self.schedule) {
+            Motion::Steps(steps) => {
+                if !lay_out(steps, &mut self.schedule) {
                     return Err(ControlError::Model { reason: "the steps do not fit one after the other" });
                 }
-                let height = aim.height_m - 0.5 * (first.position_w.z + second.position_w.z);
-                let gravity = model.tree.gravity_w().norm();
-                aim.mass_centre = Some(mass_centre_over(&steps, &places, aim.path.origin, height, gravity));
+                let ground = places.iter().map(|place| place.position_w.z).sum::<f64>() / places.len() as f64;
+                let (height, gravity) = (aim.height_m - ground, model.tree.gravity_w().norm());
+                aim.mass_centre = Some(mass_centre_over(steps, &places, aim.path.origin, height, gravity));
             }
         }
         self.placed = true;

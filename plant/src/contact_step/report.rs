@@ -4,13 +4,18 @@
 
 use super::*;
 
-/// A point of the robot that may touch the ground.
+/// A point of the robot, or a small sphere around it, that may touch the ground.
+///
+/// A sphere touches with its lowest point, so it rolls: that point is found anew at the begin of every step and held over it, an error
+/// of the radius times the square of the angle turned in a step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ContactPoint {
     /// Body index.
     pub body: usize,
     /// Point in the body's link frame, m.
     pub point: Vector3<f64>,
+    /// Radius of the sphere around it, m; 0: the point itself touches.
+    pub radius: f64,
     /// Friction coefficient of point and ground.
     pub friction: f64,
 }

@@ -18,6 +18,7 @@ pub fn model(robot: &RobotModel, friction: f64) -> PlantModel {
     let contacts = robot.contacts.iter().map(|contact| ContactPoint {
         body: contact.body.unwrap(),
         point: contact.position,
+        radius: 0.0,
         friction,
     });
     let feet = robot.soles.iter().map(|sole| {

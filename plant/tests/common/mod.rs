@@ -94,7 +94,7 @@ pub fn corners(size: Vector3<f64>, friction: f64, all: bool) -> Vec<ContactPoint
         for x in [-0.5, 0.5] {
             for y in [-0.5, 0.5] {
                 let point = Vector3::new(x, y, z).component_mul(&size);
-                points.push(ContactPoint { body: 0, point, friction });
+                points.push(ContactPoint { body: 0, point, radius: 0.0, friction });
             }
         }
     }

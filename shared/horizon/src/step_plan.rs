@@ -20,40 +20,6 @@ pub struct Step {
     pub touch_s: f64,
 }
 
-/// Steps straight ahead of a robot on two feet.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct StraightWalk {
-    /// How many.
-    pub count: usize,
-    /// Length of one, m; the first and the last are half as long.
-    pub length_m: f64,
-    /// Time in the air, s.
-    pub swing_s: f64,
-    /// Time on both feet between two steps, s.
-    pub both_s: f64,
-    /// When the first foot lifts off, s.
-    pub start_s: f64,
-}
-
-impl StraightWalk {
-    /// The steps of feet that stand at `places`; ends with the feet side by side. Allocates.
-    pub fn steps(&self, places: &[Foothold; 2]) -> Vec<Step> {
-        let forward = places[0].axes_w.column(0) + places[1].axes_w.column(0);
-        let forward = forward.normalize();
-        (0..self.count)
-            .map(|k| {
-                let foot = k % 2;
-                // Each foot lands one length ahead of the other; the last one beside it.
-                let lengths = if k + 1 == self.count { k } else { k + 1 };
-                let mut to = places[foot];
-                to.position_w += forward * (self.length_m * lengths as f64);
-                let lift_s = self.start_s + k as f64 * (self.swing_s + self.both_s);
-                Step { foot, to, lift_s, touch_s: lift_s + self.swing_s }
-            })
-            .collect()
-    }
-}
-
 /// Lays steps out; `false`: one does not fit.
 pub fn lay_out(steps: &[Step], schedule: &mut ContactSchedule) -> bool {
     steps.iter().all(|step| schedule.step(step.foot, step.lift_s, step.touch_s, step.to))
@@ -111,8 +77,15 @@ mod tests {
     fn a_walk_ends_side_by_side_with_the_mass_centre_in_between() {
         let place = |y: f64| Foothold::level(Vector3::new(0.0, y, 0.0), 0.0);
         let places = [place(0.1), place(-0.1)];
-        let walk = StraightWalk { count: 5, length_m: 0.3, swing_s: 0.6, both_s: 0.2, start_s: 1.0 };
-        let steps = walk.steps(&places);
+        let lengths = [0.3, 0.6, 0.9, 1.2, 1.2];
+        let steps: Vec<Step> = (0..5)
+            .map(|k| {
+                let mut to = places[k % 2];
+                to.position_w.x = lengths[k];
+                let lift_s = 1.0 + 0.8 * k as f64;
+                Step { foot: k % 2, to, lift_s, touch_s: lift_s + 0.6 }
+            })
+            .collect();
         let mut schedule = ContactSchedule::standing(&places, 8);
         assert!(lay_out(&steps, &mut schedule));
         let last = |foot: usize| schedule.stances(foot).last().unwrap().place.position_w.x;

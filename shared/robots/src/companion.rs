@@ -290,11 +290,13 @@ impl CompanionFile {
                 let contact = &model.contacts[index];
                 let point = frame.pose.inverse().transform_point(&contact.position);
                 // A tenth of a millimetre: soles in model files are flat to their last digit.
-                in_plane &= contact.body == frame.body && point.z.abs() < 1e-4;
+                let is_point = table.corners.len() == 1;
+                in_plane &= contact.body == frame.body && (is_point || point.z.abs() < 1e-4);
                 polygon.push(point.xy());
                 contacts.push(index);
             }
-            if !in_plane || !is_convex(&polygon) {
+            // One corner: a foot that stands on a point or a sphere.
+            if !in_plane || (polygon.len() != 1 && !is_convex(&polygon)) {
                 return refuse(Rule::SolePolygon);
             }
             model.soles.push(Sole {

@@ -167,7 +167,7 @@ pub enum Rule {
     },
     /// Sole corners that are not a convex counter-clockwise polygon in the frame's plane, on the frame's link.
     #[error(
-        "its corners are not a convex polygon, counter-clockwise from above, on the link and in the plane of its frame"
+        "its corners are neither one contact of its frame's link nor a convex polygon, counter-clockwise from above, on the link and in the plane of its frame"
     )]
     SolePolygon,
 }

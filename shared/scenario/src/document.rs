@@ -7,6 +7,7 @@ use toml::de::{DeTable, DeValue};
 use toml::{Spanned, Table, Value};
 
 use crate::fault::FAULT_KINDS;
+use crate::feet::GAIT_KINDS;
 use crate::range::check;
 use crate::{Place, Scenario, ScenarioError};
 
@@ -14,8 +15,9 @@ use crate::{Place, Scenario, ScenarioError};
 const LARGEST_FILE: u64 = 1 << 20;
 
 /// Keys that hold one table or a list of tables.
-const LISTS: [&str; 9] = [
+const LISTS: [&str; 10] = [
     "push",
+    "step",
     "fault",
     "terrain.box",
     "terrain.gap",
@@ -25,6 +27,9 @@ const LISTS: [&str; 9] = [
     "plan.spring",
     "plan.bound",
 ];
+
+/// Keys that hold a name or a list of names.
+const NAME_LISTS: [&str; 1] = ["robot.stance"];
 
 /// In the catalogue, the name that stands for all names.
 pub(crate) const ANY_NAME: &str = "*";
@@ -292,6 +297,12 @@ impl Document {
                 let each = |(value, pattern)| self.typed(key, value, pattern);
                 Ok(Value::Array(list.into_iter().zip(known).map(each).collect::<Result<_, _>>()?))
             }
+            (Value::Array(list), Value::String(_)) if NAME_LISTS.contains(&key) => {
+                if list.is_empty() || !list.iter().all(Value::is_str) {
+                    return wrong(&Value::Array(list), "a name, or a list of names".to_owned());
+                }
+                Ok(Value::Array(list))
+            }
             (Value::Integer(value), Value::Float(_)) => Ok(Value::Float(value as f64)),
             (Value::Integer(value), Value::Integer(_)) if value < 0 => {
                 wrong(&Value::Integer(value), "a whole number from 0 on".to_owned())
@@ -429,6 +440,7 @@ fn words(key: &str) -> Option<&'static [&'static str]> {
     match of_list.as_deref().unwrap_or(key) {
         "fault.kind" => Some(&FAULT_KINDS),
         "fault.target" => Some(&["state", "command", "plant", "controller", "machine"]),
+        "gait.kind" => Some(&GAIT_KINDS),
         "clock" => Some(&["realtime", "lockstep"]),
         "controller.kind" => Some(&["mpc", "static-lqr", "off"]),
         _ => None,

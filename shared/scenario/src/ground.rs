@@ -10,8 +10,8 @@ use serde::{Deserialize, Serialize};
 pub struct RobotSettings {
     /// URDF file, relative to the scenario file; its companion table lies beside it.
     pub urdf: String,
-    /// Sole it stands on, by its name in the companion table.
-    pub stance: String,
+    /// Soles it stands on, by their names in the companion table: one, a list, or "all".
+    pub stance: crate::Stance,
     /// Posture it begins and rests in, by its name in the companion table.
     pub posture: String,
     /// Whether inertias that no body has are taken as they are, and joints that carry no mass are held; as the key of the companion table.

@@ -28,6 +28,7 @@
 mod document;
 mod error;
 mod fault;
+mod feet;
 mod ground;
 mod list;
 mod plan;
@@ -37,6 +38,7 @@ mod scenario;
 pub use document::Document;
 pub use error::{Place, ScenarioError};
 pub use fault::{FaultKind, FaultSettings, FaultTarget};
+pub use feet::{GaitKind, GaitSettings, LeggedSettings, Stance, StepSettings};
 pub use ground::{BoxSettings, GapSettings, RobotSettings, StartSettings, TerrainSettings};
 pub use plan::{PlanBound, PlanGap, PlanObstacle, PlanSettings, PlanSpring, PlanStep, PlanWeightSettings};
 pub use scenario::{

@@ -127,6 +127,9 @@ fn check_controller(broken: &mut Broken, scenario: &Scenario) {
         broken.push(violation("controller.command_life_s", life.to_string(), &rule, "give a longer life"));
     }
     check_weights(broken, controller);
+    for (key, value, least, most) in controller.legged.ranges() {
+        broken.within(key, value, least, most);
+    }
 }
 
 /// What happens in a run.
@@ -161,6 +164,16 @@ fn check_events(broken: &mut Broken, scenario: &Scenario) {
         broken.within(&key("duration_s"), push.duration_s, plant.step_s, 3600.0);
     }
 
+    for (key, value, least, most) in scenario.gait.iter().flat_map(crate::GaitSettings::ranges) {
+        broken.within(key, value, least, most);
+    }
+    for (index, step) in scenario.step.iter().enumerate() {
+        let key = |name: &str| format!("step[{index}].{name}");
+        broken.within(&key("time_s"), step.time_s, 0.0, 3600.0);
+        broken.within(&key("swing_s"), step.swing_s, 0.05, 10.0);
+        broken.each(&key("position_m"), &step.position_m, 100.0);
+        broken.within(&key("yaw_rad"), step.yaw_rad, -7.0, 7.0);
+    }
     for (key, value, least, most) in scenario.plan.iter().flat_map(crate::PlanSettings::ranges) {
         broken.within(key, value, least, most);
     }

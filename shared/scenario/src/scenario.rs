@@ -3,7 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    BoxSettings, FaultSettings, GapSettings, PlanSettings, RobotSettings, StartSettings, TerrainSettings,
+    BoxSettings, FaultSettings, GaitSettings, GapSettings, LeggedSettings, PlanSettings, RobotSettings,
+    StartSettings, StepSettings, TerrainSettings,
 };
 
 /// Everything that decides a run.
@@ -40,6 +41,12 @@ pub struct Scenario {
     /// Faults on purpose: one table `[fault]` or a list `[[fault]]`.
     #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
     pub fault: Vec<FaultSettings>,
+    /// A gait on four feet.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gait: Option<GaitSettings>,
+    /// Single steps: a list `[[step]]`.
+    #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
+    pub step: Vec<StepSettings>,
     /// A motion to be planned through contact.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub plan: Option<PlanSettings>,
@@ -183,6 +190,8 @@ pub struct ControllerSettings {
     pub weights: WeightSettings,
     /// What it must keep to.
     pub constraints: ConstraintSettings,
+    /// The same trade on several feet, or on the way.
+    pub legged: LeggedSettings,
 }
 
 /// Weights of the controller's tasks: one over the square of the deviation that counts 1. 0 switches a task off.
@@ -370,6 +379,8 @@ impl Default for Scenario {
             reach: None,
             push: Vec::new(),
             fault: Vec::new(),
+            gait: None,
+            step: Vec::new(),
             plan: None,
             success: SuccessSettings::default(),
             timing: TimingSettings::default(),
@@ -443,6 +454,7 @@ impl Default for ControllerSettings {
             command_life_s: 0.1,
             weights: WeightSettings::default(),
             constraints: ConstraintSettings::default(),
+            legged: LeggedSettings::default(),
         }
     }
 }
@@ -549,6 +561,8 @@ impl Scenario {
                 gaps: vec![GapSettings::default()],
             },
             fault: vec![FaultSettings::default()],
+            gait: Some(GaitSettings::default()),
+            step: vec![StepSettings::default()],
             plan: Some(PlanSettings::catalogue()),
             timing: TimingSettings {
                 max_misses: Some(0),
