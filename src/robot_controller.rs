@@ -216,6 +216,7 @@ pub fn estimator_config(scenario: &Scenario) -> EstimatorConfig {
         accelerometer_bias_walk: scaled(s.accelerometer_bias_walk_m_s2, 1e-5),
         position_noise: scaled(s.position_noise_rad.max(0.3 * s.position_resolution_rad), 1e-6),
         velocity_noise: scaled(s.velocity_noise_rad_s.max(0.3 * s.velocity_resolution_rad_s), 1e-4),
+        foot_force_noise: s.noise_scale * s.foot_force_noise_n,
         ..EstimatorConfig::default()
     }
 }

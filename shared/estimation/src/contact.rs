@@ -1,7 +1,7 @@
 //! Whether a foot carries load, and where.
 //!
 //! ```text
-//! on:   f_z > load_on m g  for debounce_s        off:  f_z < load_off m g  for debounce_s
+//! on:   f_z > max(load_on m g, 3 σ)  for debounce_s        off:  f_z < max(load_off m g, 1.5 σ)  for debounce_s
 //! c = clamp_to_sole( (-τ_y, τ_x) / f_z )          pressure point: of a sole that rocks, the point that rests
 //! ```
 //!
@@ -42,6 +42,9 @@ impl Default for FootEstimate {
     }
 }
 
+/// So many standard deviations of its noise are a load.
+const NOISE_DEVIATIONS: f64 = 3.0;
+
 /// The switch of one foot.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ContactSwitch {
@@ -61,14 +64,17 @@ impl ContactSwitch {
         time_s: f64,
         out: &mut FootEstimate,
     ) {
+        let least = NOISE_DEVIATIONS * config.foot_force_noise;
+        let (on, off) = ((config.load_on * weight).max(least), (config.load_off * weight).max(0.5 * least));
         let (above, below) = match &measured.wrench_s {
             Some(wrench) => {
                 out.load_n = wrench.force.z;
                 let point = Vector2::new(-wrench.torque.y, wrench.torque.x) / wrench.force.z;
-                if wrench.force.z > config.load_off * weight && point.iter().all(|x| x.is_finite()) {
+                let flat = foot.polygon.len() >= 3;
+                if flat && wrench.force.z > off && point.iter().all(|x| x.is_finite()) {
                     (out.pressure_point, out.margin) = clamp_to(&foot.polygon, point);
                 }
-                (wrench.force.z > config.load_on * weight, wrench.force.z < config.load_off * weight)
+                (wrench.force.z > on, wrench.force.z < off)
             }
             None => {
                 out.load_n = 0.0;

@@ -69,6 +69,8 @@ pub struct EstimatorConfig {
     pub sole_rate: f64,
     /// Tilt of the ground, or of the foot on it, that is taken for possible before anything is measured, rad.
     pub first_tilt: f64,
+    /// Noise of a foot's normal force, N: what could be noise is no load.
+    pub foot_force_noise: f64,
     /// A foot carries load above this part of the weight ...
     pub load_on: f64,
     /// ... until it is below this one.
@@ -94,6 +96,7 @@ impl Default for EstimatorConfig {
             contact_walk: 1e-3,
             sole_rate: 0.01,
             first_tilt: 0.05,
+            foot_force_noise: 0.0,
             load_on: 0.05,
             load_off: 0.02,
             debounce_s: 0.002,
