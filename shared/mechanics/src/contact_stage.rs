@@ -145,9 +145,7 @@ impl ContactStage {
         }
         let m = first_rows[contacts.len()];
         let (nv, nu, s) = (tree.dof(), tree.joint_count(), rule.unknown_nodes());
-        let capacity =
-            ForceCapacity { points: 0, laws: contacts.iter().any(|c| c.kind == ContactKind::Foot) };
-        let mut del = DelWorkspace::with_loads(tree, rule, 1.0, capacity, contacts.len())?;
+        let mut del = DelWorkspace::with_loads(tree, rule, 1.0, ForceCapacity::default(), contacts.len())?;
         for contact in contacts.iter().filter(|c| c.kind == ContactKind::Foot) {
             let torque_w = vec![[Quad::ZERO; 3]; del.groups];
             del.held_torques.push(HeldTorque { body: contact.body, torque_w });

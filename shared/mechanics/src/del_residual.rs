@@ -63,8 +63,8 @@ pub(crate) struct DeadLoad {
     pub couple: bool,
 }
 
-/// A torque that keeps its direction in {0} (foot contact). Its gain `τ×η_ω` is not symmetric: it goes with the laws, so the workspace
-/// needs [`ForceCapacity::laws`].
+/// A torque that keeps its direction in {0} (foot contact). Its gain `τ×η_ω` is not symmetric. In workspaces with wrenches of the general
+/// kind it goes with these, else with the loads ([`crate::del_hessian`] corrects the mirror images). Algorithm B.1 does not know it.
 #[derive(Clone, Debug)]
 pub(crate) struct HeldTorque {
     pub body: usize,
@@ -348,6 +348,18 @@ impl DelWorkspace {
                 }
             }
         }
+    }
+
+    /// Whether something besides gravity acts that keeps its direction in {0}.
+    #[inline(always)]
+    pub(crate) fn has_dead_loads(&self) -> bool {
+        !self.loads.is_empty() || !self.dead_torques().is_empty()
+    }
+
+    /// Held torques that go with the loads.
+    #[inline(always)]
+    pub(crate) fn dead_torques(&self) -> &[HeldTorque] {
+        if self.gains.is_empty() { &self.held_torques } else { &[] }
     }
 
     /// Adds a load whose force differs from node to node (constraint forces); returns its index.
