@@ -54,7 +54,7 @@ use crate::row_matrix::RowMatrix;
 use crate::state::State;
 use crate::step::{Integrator, StepOptions};
 use crate::tree::KinematicTree;
-use nalgebra::Matrix3;
+use nalgebra::{Matrix3, Vector6};
 
 mod boundary_kinematics;
 mod boundary_state;
@@ -99,8 +99,8 @@ pub struct ContactStage {
     active: Vec<ActiveRow>,
     /// `[node * contacts + contact]`.
     placements: Vec<Placement>,
-    /// Derivatives of the momenta by `q` at a boundary: `nv x joints`.
-    momentum_gradient: Vec<f64>,
+    /// Change of the momentum at the end, in base axes there, by node γ: `[dof (s + 1) + γ]`.
+    impulses: Vec<Vector6<f64>>,
     /// `[1 | x | u]` right-hand sides, then `𝒜`; row `dof * s + node`.
     columns: RowMatrix,
     /// `𝒢Z + h`, then `δΛ`: row `(γ - 1) * m + row`, or `α * m + row`.
@@ -108,6 +108,8 @@ pub struct ContactStage {
     /// `x'_raw`, then `x_{k+1}`.
     ends: RowMatrix,
     end_multipliers: RowMatrix,
+    /// `𝓜⁻¹G_s^T` in the lower `nv` rows.
+    end_responses: RowMatrix,
     schur: DenseLu,
     /// `X = J⁻¹𝒜`, row-major.
     responses: Vec<f64>,
@@ -166,11 +168,12 @@ impl ContactStage {
             state: State::zeros(tree),
             active: Vec::with_capacity(m),
             placements: vec![Placement::none(); (s + 1) * contacts.len()],
-            momentum_gradient: vec![0.0; nv * nu],
+            impulses: vec![Vector6::zeros(); nv * (s + 1)],
             columns: RowMatrix::zeros(s * nv, columns + s * m),
             multipliers: RowMatrix::zeros(s * m, columns + s * m),
             ends: RowMatrix::zeros(2 * nv, columns),
             end_multipliers: RowMatrix::zeros(m, columns),
+            end_responses: RowMatrix::zeros(2 * nv, m),
             schur: DenseLu::new(s * m),
             responses: vec![0.0; s * nv * (s * m).max(1)],
             gradient: SparseRows::new(s * m, s * m * (12 + longest)),
@@ -251,10 +254,10 @@ impl ContactStage {
     ) -> Result<(), StepError> {
         self.begin(tree, time_step, active, start, u)?;
         self.end.update(tree, end)?;
-        self.projection.factor(tree, &self.end, &self.contacts, active, self.regularisation)?;
         self.place_nodes(tree, nominal)?;
+        self.factor_end_responses(tree, active)?;
         self.solver_factor(tree)?;
-        self.fill_columns(tree)?;
+        self.fill_columns(tree);
         self.solve_saddle(tree, true)?;
         self.end_rows(tree, end)?;
         self.write(nominal, out);

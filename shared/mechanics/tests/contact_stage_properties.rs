@@ -84,8 +84,7 @@ fn canonical(robot: &Robot, state: &BoundaryState) -> DMatrix<f64> {
     let (nv, joints) = (robot.tree.dof(), robot.tree.joint_count());
     let boundary = robot.boundary(state);
     let mut map = DMatrix::identity(2 * nv, 2 * nv);
-    let mut gradient = vec![0.0; nv * joints];
-    boundary.momentum_gradient_into(&robot.tree, &mut gradient).unwrap();
+    let gradient = boundary.momentum_gradient();
     let momentum = boundary.base_pose_w().inverse_transform_wrench(&boundary.momentum_w());
     for r in 0..nv {
         for c in 0..nv {
@@ -298,13 +297,13 @@ fn without_active_contacts_it_is_the_step_of_the_integrator_bit_for_bit() {
     let mut stage = robot.stage(2);
     let (_, end) = robot.solve(&mut stage, 0.01, &robot.start);
     let mut state = State::zeros(&robot.tree);
-    robot.boundary(&robot.start).state_into(&robot.start.q, &mut state).unwrap();
+    robot.boundary(&robot.start).state_into(&mut state).unwrap();
     let mut integrator = sample_robots::integrator(&robot.tree, 2, 0.01);
     integrator.step(&robot.tree, &mut state, &StepForces::held(&robot.u)).unwrap();
     assert_eq!(end.q, state.q);
     assert_eq!(end.base_pose_w(), state.base_pose);
     let mut momenta = State::zeros(&robot.tree);
-    robot.boundary(&end).state_into(&end.q, &mut momenta).unwrap();
+    robot.boundary(&end).state_into(&mut momenta).unwrap();
     assert!(difference(&momenta.p, &state.p) < 1e-13);
 
     // A, B against the linearisation of the floating base, in its coordinates.
@@ -312,7 +311,7 @@ fn without_active_contacts_it_is_the_step_of_the_integrator_bit_for_bit() {
     let mut work =
         Linearizer::new(&robot.tree, &integrator, StateCoordinates::Momentum, InputHold::Held).unwrap();
     let mut start = State::zeros(&robot.tree);
-    robot.boundary(&robot.start).state_into(&robot.start.q, &mut start).unwrap();
+    robot.boundary(&robot.start).state_into(&mut start).unwrap();
     integrator.forget();
     integrator.solve(&robot.tree, &start, &StepForces::held(&robot.u)).unwrap();
     let linear = work.linearize(&robot.tree, &mut integrator).unwrap();

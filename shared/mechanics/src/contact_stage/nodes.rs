@@ -31,8 +31,13 @@ impl ContactStage {
                 self.active.push(ActiveRow { contact: index, row, of_all: self.first_rows[index] + place });
             }
         }
-        self.start.update(tree, start)?;
-        self.start.state_into(&start.q, &mut self.state)?;
+        // The end of one stage is most often the start of the next.
+        if self.end.is_at(start) {
+            core::mem::swap(&mut self.start, &mut self.end);
+        } else if !self.start.is_at(start) {
+            self.start.update(tree, start)?;
+        }
+        self.start.state_into(&mut self.state)?;
         if self.del.time_step() != time_step {
             self.del.set_time_step(time_step)?;
         }

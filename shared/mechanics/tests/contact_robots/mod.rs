@@ -145,7 +145,7 @@ impl Robot {
             .collect();
         let mut u = vec![0.0; self.tree.joint_count()];
         let boundary = self.boundary(&self.start);
-        boundary.static_torques_into(&self.tree, &self.start.q, &standing, &force, &mut u).unwrap();
+        boundary.static_torques_into(&self.tree, &standing, &force, &mut u).unwrap();
         u
     }
 
