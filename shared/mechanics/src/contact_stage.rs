@@ -177,7 +177,7 @@ impl ContactStage {
             schur: DenseLu::new(s * m),
             responses: vec![0.0; s * nv * (s * m).max(1)],
             gradient: SparseRows::new(s * m, s * m * (12 + longest)),
-            end_of_nodes: SparseRows::new(2 * nv, 36 + nv + s * (12 * nv + relatives.len())),
+            end_of_nodes: end::end_pattern(&relatives, nv, s),
             end_of_multipliers: SparseRows::new(m.max(6), 6 * s * m + 2 * m * longest),
             relatives,
             velocity_gradient: vec![0.0; MAX_ROWS * nv],
@@ -233,6 +233,13 @@ impl ContactStage {
     pub fn lifted(&self) -> LiftedStage {
         let nv = self.change.len();
         LiftedStage::new(nv, nv - 6, self.del.unknown_nodes(), self.contacts.len(), self.row_count())
+    }
+
+    /// The same without the maps of the nodes, for those who place the nodes otherwise ([`StageNominal::interpolate`]).
+    pub fn lifted_without_nodes(&self) -> LiftedStage {
+        let mut lifted = self.lifted();
+        lifted.nodes = Vec::new();
+        lifted
     }
 
     /// Linearises the unsolved stage between `start` and `end` about `nominal` under held joint forces `u` (N·m or N). No allocation.

@@ -14,8 +14,9 @@ use alloc::vec::Vec;
 use nalgebra::{Matrix6, Vector6};
 
 use super::right_hand_sides::{joint_twist, shift_gain};
-use super::row_product::{AddDense, AddProduct, SolveRows};
+use super::row_product::{AddDense, AddProduct, SolveRows, SparseRows};
 use super::{BoundaryState, ContactStage, LiftedStage, StageNominal};
+use crate::del_hessian::DelHessian;
 use crate::errors::StepError;
 use crate::lanes::LANES;
 use crate::linearize::SolveMass;
@@ -71,6 +72,47 @@ impl Relatives {
     fn of(&self, joint: usize) -> &[Relative] {
         &self.list[self.starts[joint]..self.starts[joint + 1]]
     }
+}
+
+impl Relative {
+    /// `H[α,γ]` with the own joint as row.
+    #[inline(always)]
+    fn entry(&self, hessian: &DelHessian, pair: usize, alpha: usize, gamma: usize) -> f64 {
+        if self.mirrored { hessian.mirrored(pair, alpha, gamma) } else { hessian.entry(pair, alpha, gamma) }
+    }
+}
+
+/// The places of the products of [`ContactStage::end_rows`] with the nodes: rows of `ε`, `δq`, `Π`, `p_j`.
+pub(super) fn end_pattern(relatives: &Relatives, nv: usize, s: usize) -> SparseRows {
+    let mut rows = SparseRows::new(2 * nv, 36 + nv + s * (12 * nv + relatives.len()));
+    for _ in 0..6 {
+        for l in 0..6 {
+            rows.push(l * s + s - 1, 0.0);
+        }
+        rows.end_row();
+    }
+    for dof in 6..nv {
+        rows.push(dof * s + s - 1, 0.0);
+        rows.end_row();
+    }
+    for _ in 0..6 {
+        for source in 0..nv * s {
+            rows.push(source, 0.0);
+        }
+        rows.end_row();
+    }
+    for joint in 0..nv - 6 {
+        for source in 0..6 * s {
+            rows.push(source, 0.0);
+        }
+        for relative in relatives.of(joint) {
+            for gamma in 0..s {
+                rows.push(relative.dof as usize * s + gamma, 0.0);
+            }
+        }
+        rows.end_row();
+    }
+    rows
 }
 
 /// What the rows of the end share.
@@ -135,23 +177,21 @@ impl ContactStage {
         }
     }
 
-    /// Products with `δΞ`.
+    /// Products with `δΞ`, in the order of [`end_pattern`].
     fn fill_end_of_nodes(&mut self, tree: &KinematicTree, frame: &EndFrame) {
         let Self { del, solver, end_of_nodes: rows, end, impulses, relatives, .. } = self;
         let momentum_gradient = end.momentum_gradient();
         let Some(hessian) = solver.hessian() else { return };
         let (nv, s) = (tree.dof(), del.unknown_nodes());
         let joints = nv - 6;
-        rows.clear();
+        rows.rewind();
         for k in 0..6 {
             for l in 0..6 {
-                rows.push(l * s + s - 1, frame.twist[(k, l)]);
+                rows.refill(frame.twist[(k, l)]);
             }
-            rows.end_row();
         }
-        for dof in 6..nv {
-            rows.push(dof * s + s - 1, 1.0);
-            rows.end_row();
+        for _ in 6..nv {
+            rows.refill(1.0);
         }
         let start_twists = base_matrix(del, 0);
         let mut rigid = Matrix6::zeros();
@@ -164,49 +204,36 @@ impl ContactStage {
                 impulses[dof * (s + 1) + gamma] = to_base * Vector6::from(hessian.impulse_column(dof, gamma));
             }
         }
-        let impulse = |dof: usize, gamma: usize| &impulses[dof * (s + 1) + gamma];
         let shifted = to_base * rigid * start_twists + frame.turn * frame.twist;
         for k in 0..6 {
-            for l in 0..6 {
+            for (dof, impulse) in impulses.chunks_exact(s + 1).enumerate() {
                 for gamma in 1..s {
-                    rows.push(l * s + gamma - 1, impulse(l, gamma)[k]);
+                    rows.refill(impulse[gamma][k]);
                 }
-                rows.push(l * s + s - 1, impulse(l, s)[k] - impulse(l, 0)[k] + shifted[(k, l)]);
+                rows.refill(if dof < 6 {
+                    impulse[s][k] - impulse[0][k] + shifted[(k, dof)]
+                } else {
+                    impulse[s][k] - momentum_gradient[k * joints + dof - 6]
+                });
             }
-            for dof in 6..nv {
-                for gamma in 1..s {
-                    rows.push(dof * s + gamma - 1, impulse(dof, gamma)[k]);
-                }
-                let moved = momentum_gradient[k * joints + dof - 6];
-                rows.push(dof * s + s - 1, impulse(dof, s)[k] - moved);
-            }
-            rows.end_row();
         }
         for joint in 0..joints {
             let first = hessian.pair_starts[joint + 1];
             let shift = start_twists.tr_mul(&Vector6::from(hessian.shift_row(joint + 6, s)));
             for l in 0..6 {
                 for gamma in 1..s {
-                    rows.push(l * s + gamma - 1, hessian.entry(first + l, s, gamma));
+                    rows.refill(hessian.entry(first + l, s, gamma));
                 }
-                let last = hessian.entry(first + l, s, s) - hessian.entry(first + l, s, 0) + shift[l];
-                rows.push(l * s + s - 1, last);
+                rows.refill(hessian.entry(first + l, s, s) - hessian.entry(first + l, s, 0) + shift[l]);
             }
+            let gradient = &momentum_gradient[(6 + joint) * joints..(7 + joint) * joints];
             for relative in relatives.of(joint) {
-                let (dof, pair) = (relative.dof as usize, relative.pair as usize);
-                for gamma in 1..=s {
-                    let mut entry = if relative.mirrored {
-                        hessian.mirrored(pair, s, gamma)
-                    } else {
-                        hessian.entry(pair, s, gamma)
-                    };
-                    if gamma == s {
-                        entry -= momentum_gradient[(6 + joint) * joints + dof - 6];
-                    }
-                    rows.push(dof * s + gamma - 1, entry);
+                let pair = relative.pair as usize;
+                for gamma in 1..s {
+                    rows.refill(relative.entry(hessian, pair, s, gamma));
                 }
+                rows.refill(relative.entry(hessian, pair, s, s) - gradient[relative.dof as usize - 6]);
             }
-            rows.end_row();
         }
     }
 
@@ -278,8 +305,7 @@ impl ContactStage {
             }
             for relative in relatives.of(joint) {
                 let pair = relative.pair as usize;
-                let entry =
-                    if relative.mirrored { hessian.mirrored(pair, s, 0) } else { hessian.entry(pair, s, 0) };
+                let entry = relative.entry(hessian, pair, s, 0);
                 ends.add(nv + dof, 1 + relative.dof as usize, entry);
             }
             let step = del.rule.weights()[s] * del.time_step;
@@ -427,7 +453,8 @@ impl ContactStage {
         }
         out.residual = self.residual.iter().fold(0.0, |largest: f64, x| largest.max(x.abs()));
         copy_rows(&self.ends, 0, 2 * nv, &mut out.transition, columns);
-        for alpha in 1..=s {
+        let maps = if out.nodes.is_empty() { 0 } else { s };
+        for alpha in 1..=maps {
             for dof in 0..nv {
                 let at = ((alpha - 1) * nv + dof) * columns;
                 copy_rows(&self.columns, dof * s + alpha - 1, 1, &mut out.nodes[at..], columns);

@@ -102,7 +102,7 @@ impl LiftedStage {
         row_of(&self.forces, row, self.columns())
     }
 
-    /// Change of node coordinate `row` (node-major from node 1 on, base chart first).
+    /// Change of node coordinate `row` (node-major from node 1 on, base chart first); empty without the maps of the nodes.
     pub fn node_row(&self, row: usize) -> &[f64] {
         row_of(&self.nodes, row, self.columns())
     }

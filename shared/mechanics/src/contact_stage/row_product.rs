@@ -6,12 +6,14 @@ use crate::dense_lu::DenseLu;
 use crate::lanes::{Kernel, Quad, Simd, WIDE, WideLane};
 use crate::row_matrix::RowMatrix;
 
-/// A matrix of compressed rows that is filled anew for every stage.
+/// A matrix of compressed rows whose factors change from stage to stage, its places with the set of contacts at most.
 #[derive(Clone, Debug)]
 pub(super) struct SparseRows {
     starts: Vec<u32>,
     sources: Vec<u32>,
     factors: Vec<f64>,
+    /// Entries filled.
+    filled: usize,
 }
 
 impl SparseRows {
@@ -19,7 +21,7 @@ impl SparseRows {
     pub fn new(rows: usize, entries: usize) -> Self {
         let mut starts = Vec::with_capacity(rows + 1);
         starts.push(0);
-        Self { starts, sources: Vec::with_capacity(entries), factors: Vec::with_capacity(entries) }
+        Self { starts, sources: Vec::with_capacity(entries), factors: Vec::with_capacity(entries), filled: 0 }
     }
 
     pub fn clear(&mut self) {
@@ -39,6 +41,19 @@ impl SparseRows {
     #[inline(always)]
     pub fn end_row(&mut self) {
         self.starts.push(self.sources.len() as u32);
+    }
+
+    /// Begins to fill in new factors of the entries that are there, by [`SparseRows::refill`] in the order of the pushes.
+    pub fn rewind(&mut self) {
+        self.filled = 0;
+    }
+
+    #[inline(always)]
+    pub fn refill(&mut self, factor: f64) {
+        if let Some(target) = self.factors.get_mut(self.filled) {
+            *target = factor;
+        }
+        self.filled += 1;
     }
 }
 
