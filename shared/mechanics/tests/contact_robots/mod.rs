@@ -14,6 +14,7 @@ use crate::oracle;
 use crate::sample_robots::{Forces, GRAVITY, quadruped, spread};
 
 /// A robot, its contacts, and a start that moves on the active ones.
+#[derive(Clone)]
 pub struct Robot {
     pub tree: KinematicTree,
     pub contacts: Vec<Contact>,
