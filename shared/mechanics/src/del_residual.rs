@@ -33,9 +33,11 @@ use crate::spatial::{RigidTransform, Twist, Wrench, exp_rotation};
 use crate::state::State;
 use crate::tree::KinematicTree;
 
+mod held_torque;
 mod inward;
 mod outward;
 
+pub(crate) use held_torque::HeldTorque;
 use inward::Inward;
 pub(crate) use inward::{load_arm, weighted_sum};
 use outward::Outward;
@@ -61,15 +63,6 @@ pub(crate) struct DeadLoad {
     pub arm_b: [f64; 3],
     /// A couple `arm × f` without resultant force, instead of a force at the point.
     pub couple: bool,
-}
-
-/// A torque that keeps its direction in {0} (foot contact). Its gain `τ×η_ω` is not symmetric. In workspaces with wrenches of the general
-/// kind it goes with these, else with the loads ([`crate::del_hessian`] corrects the mirror images). Algorithm B.1 does not know it.
-#[derive(Clone, Debug)]
-pub(crate) struct HeldTorque {
-    pub body: usize,
-    /// N·m at the nodes: one 3-vector per lane group.
-    pub torque_w: Vec<[Quad; 3]>,
 }
 
 /// Wrench of the laws on one body and its gains, at the nodes of one lane group.
@@ -350,18 +343,6 @@ impl DelWorkspace {
         }
     }
 
-    /// Whether something besides gravity acts that keeps its direction in {0}.
-    #[inline(always)]
-    pub(crate) fn has_dead_loads(&self) -> bool {
-        !self.loads.is_empty() || !self.dead_torques().is_empty()
-    }
-
-    /// Held torques that go with the loads.
-    #[inline(always)]
-    pub(crate) fn dead_torques(&self) -> &[HeldTorque] {
-        if self.gains.is_empty() { &self.held_torques } else { &[] }
-    }
-
     /// Adds a load whose force differs from node to node (constraint forces); returns its index.
     pub(crate) fn push_load(&mut self, load: DeadLoad) -> usize {
         debug_assert!(self.loads.len() < self.load_capacity, "more loads than the workspace was made for");
@@ -501,21 +482,7 @@ impl DelWorkspace {
                 add_matrix(&mut gain.nu, &answer.d_velocity, lane);
             }
         }
-        for held in &self.held_torques {
-            for (g, [x, y, z]) in held.torque_w.iter().enumerate() {
-                let gain = &mut self.gains[held.body * self.groups + g];
-                for lane in 0..LANES {
-                    let (x, y, z) = (x.0[lane], y.0[lane], z.0[lane]);
-                    for (k, value) in [x, y, z].into_iter().enumerate() {
-                        gain.wrench[k].0[lane] += value;
-                    }
-                    // τ^
-                    for (at, value) in [(1, -z), (2, y), (6, z), (8, -x), (12, -y), (13, x)] {
-                        gain.eta[at].0[lane] += value;
-                    }
-                }
-            }
-        }
+        self.add_torques_to_gains();
     }
 
     /// The DEL residual `r^α`, `α = 0..s-1`, coordinate-major: entry `dof * s + α`. O(s n).

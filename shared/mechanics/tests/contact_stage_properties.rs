@@ -6,7 +6,7 @@ mod contact_robots;
 mod oracle;
 mod sample_robots;
 
-use contact_robots::{Robot, a, atlas, b, local, moved, quadruped_on, relative};
+use contact_robots::{Robot, a, arms_on_a_foot, atlas, b, local, moved, quadruped_on, relative};
 use delmpc_mechanics::contact_stage::{BoundaryState, Contact, ContactStage};
 use delmpc_mechanics::prelude::*;
 use delmpc_mechanics::spatial::exp_rotation;
@@ -214,7 +214,8 @@ fn difference_quotient(h: f64, mut value: impl FnMut(f64) -> Vec<f64>) -> DVecto
 
 #[test]
 fn a_and_b_of_a_touchdown_match_differences() {
-    for (name, robot) in robots() {
+    let dragged = ("arms with drag on a foot", arms_on_a_foot());
+    for (name, robot) in robots().into_iter().chain([dragged]) {
         let mut robot = touching_down(robot);
         // Wide: the hands of Atlas hardly have an inertia about their axes, their rates carry 1e-11 of round-off.
         let (dt, h, n) = (0.01, 1e-3, 2 * robot.tree.dof());
@@ -392,8 +393,8 @@ fn a_lifted_horizon_converges_quadratically_to_the_stages_solved_one_by_one() {
                 )
                 .unwrap();
             nominals[k].advance(&lifted, &x, &u);
-            let next: Vec<f64> =
-                (0..n).map(|r| lifted.d(r) + (0..n).map(|c| lifted.a(r, c) * x[c]).sum::<f64>()).collect();
+            let mut next = vec![0.0; n];
+            lifted.next_into(&x, &u, &mut next);
             if k > 0 {
                 states[k].retract(&x);
             }

@@ -127,6 +127,20 @@ impl LiftedStage {
         self.apply(self.multiplier_row(alpha, row), x, u)
     }
 
+    /// `x_{k+1} = d + A x + B u` into `next` (`2 nv`).
+    pub fn next_into(&self, x: &[f64], u: &[f64], next: &mut [f64]) {
+        for (row, value) in next.iter_mut().enumerate() {
+            *value = self.apply(self.transition_row(row), x, u);
+        }
+    }
+
+    /// Mean forces `f_0 + F_x x + F_u u` of the active rows into `force`, N or N·m.
+    pub fn force_into(&self, x: &[f64], u: &[f64], force: &mut [f64]) {
+        for (row, value) in force.iter_mut().enumerate().take(self.rows.len()) {
+            *value = self.apply(self.force_row(row), x, u);
+        }
+    }
+
     fn apply(&self, row: &[f64], x: &[f64], u: &[f64]) -> f64 {
         let Some((constant, row)) = row.split_first() else { return 0.0 };
         let (of_x, of_u) = row.split_at((2 * self.nv).min(row.len()));

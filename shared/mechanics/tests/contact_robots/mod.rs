@@ -11,7 +11,7 @@ use delmpc_mechanics::spatial::exp_rotation;
 use nalgebra::DMatrix;
 
 use crate::oracle;
-use crate::sample_robots::{Forces, GRAVITY, quadruped, spread};
+use crate::sample_robots::{Forces, GRAVITY, arms, quadruped, spread};
 
 /// A robot, its contacts, and a start that moves on the active ones.
 #[derive(Clone)]
@@ -41,6 +41,20 @@ pub fn quadruped_on(active: &[bool], forces: Forces) -> Robot {
     let mut robot = Robot { tree, contacts, active: active.to_vec(), start, u };
     robot.start = robot.projected(&robot.start);
     robot
+}
+
+/// Two arms on a base with springs, dampers, body drag and body wrenches; the end of one arm stands as a flat foot on a slope.
+pub fn arms_on_a_foot() -> Robot {
+    let tree = arms(GRAVITY, Forces::All);
+    let sole = exp_rotation(&Vector3::new(0.2, -0.1, 0.3));
+    let slope = exp_rotation(&Vector3::new(0.1, 0.2, -0.3));
+    let contacts = vec![Contact::foot(3, Vector3::new(0.02, 0.03, -0.2), sole).on(slope)];
+    let mut start = BoundaryState::zeros(&tree);
+    start.orientation = exp_rotation(&Vector3::new(0.2, -0.1, 0.4));
+    start.q = spread(4, 0.4);
+    start.base_velocity_b = Vector6::new(0.3, -0.2, 0.4, 0.3, 0.1, -0.2);
+    start.rate = spread(4, 0.5);
+    Robot { tree, contacts, active: vec![true], start, u: spread(4, 1.0) }
 }
 
 /// Atlas on its pelvis (36 coordinates), a flat foot on each leg, and the same robot rooted at its right foot.
