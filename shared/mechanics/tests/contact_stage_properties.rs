@@ -7,9 +7,9 @@ mod oracle;
 mod sample_robots;
 
 use contact_robots::{Robot, a, arms_on_a_foot, atlas, b, local, moved, quadruped_on, relative};
-use delmpc_mechanics::contact_stage::{BoundaryState, Contact, ContactStage};
+use delmpc_mechanics::contact_stage::{BoundaryKinematics, BoundaryState, Contact, ContactStage};
 use delmpc_mechanics::prelude::*;
-use delmpc_mechanics::spatial::exp_rotation;
+use delmpc_mechanics::spatial::{exp_rotation, log_rotation};
 use nalgebra::{DMatrix, DVector};
 use sample_robots::{Forces, difference};
 
@@ -440,4 +440,74 @@ fn bad_input_is_refused_with_its_name() {
     let mut nominal = stage.nominal();
     let refused = stage.solve(&robot.tree, 0.01, &[true; 2], &robot.start, &robot.u, &mut nominal, &mut end);
     assert!(matches!(refused, Err(StepError::RedundantConstraint { row: 3, .. })), "{refused:?}");
+}
+
+#[test]
+fn places_move_by_their_jacobians_and_forces_balance_by_virtual_work() {
+    let h = 1e-6;
+    for (name, robot) in robots() {
+        let (tree, nv) = (&robot.tree, robot.tree.dof());
+        let boundary = robot.boundary(&robot.start);
+        let (body, point) = (robot.contacts[0].body, Vector3::new(0.1, -0.2, 0.05));
+        let (mut of_point, mut of_turn) = (vec![0.0; 3 * nv], vec![0.0; 3 * nv]);
+        let mut of_centre = vec![0.0; 3 * nv];
+        boundary.point_jacobian_into(tree, body, &point, &mut of_point).unwrap();
+        boundary.turn_jacobian_into(tree, body, &mut of_turn).unwrap();
+        boundary.mass_centre_jacobian_into(tree, &mut of_centre).unwrap();
+        for column in 0..nv {
+            let [plus, minus] = [h, -h].map(|change| {
+                let mut x = vec![0.0; nv];
+                x[column] = change;
+                robot.boundary(&moved(&robot.start, &x))
+            });
+            let slope = |value: &dyn Fn(&BoundaryKinematics) -> Vector3<f64>| {
+                (value(&plus) - value(&minus)) / (2.0 * h)
+            };
+            let turn = log_rotation(
+                &(plus.kinematics().link_poses_w()[body].rotation
+                    * minus.kinematics().link_poses_w()[body].rotation.transpose()),
+            ) / (2.0 * h);
+            for (what, jacobian, want) in [
+                ("point", &of_point, slope(&|b| b.kinematics().point_w(body, &point))),
+                ("turn", &of_turn, turn),
+                ("mass centre", &of_centre, slope(&|b| b.mass_centre_w(tree))),
+            ] {
+                for row in 0..3 {
+                    let error = (jacobian[row * nv + column] - want[row]).abs();
+                    assert!(error < 1e-8, "{name}, {what}, column {column}: {error:e}");
+                }
+            }
+        }
+        let mut map = vec![0.0; 6 * nv];
+        boundary.centroidal_map_into(tree, &mut map).unwrap();
+        let momentum = DMatrix::from_row_slice(6, nv, &map) * DVector::from_row_slice(boundary.velocity());
+        let error = (momentum - boundary.centroidal_momentum_w(tree).to_vector()).amax();
+        assert!(error < 1e-11, "{name}: centroidal momentum {error:e}");
+
+        // u q̇ = springs - weight - contact forces for every velocity of the joints; the base keeps what is left.
+        let standing: Vec<Contact> = robot
+            .contacts
+            .iter()
+            .zip(&robot.active)
+            .filter(|(_, active)| **active)
+            .map(|(c, _)| *c)
+            .collect();
+        let (g, _) = robot.rows(&robot.start);
+        let force = sample_robots::spread(g.nrows(), 20.0);
+        let mut torque = vec![0.0; nv - 6];
+        let left = boundary.static_torques_into(tree, &standing, &force, &mut torque).unwrap().to_vector();
+        let weight = *tree.gravity_w() * tree.total_mass();
+        let pushed = g.transpose() * DVector::from_row_slice(&force);
+        for column in 0..nv {
+            let lifted: f64 = (0..3).map(|row| of_centre[row * nv + column] * weight[row]).sum();
+            let work = lifted + pushed[column];
+            let balance = if column < 6 {
+                left[column] - work
+            } else {
+                let joint = &tree.bodies()[column - 5].joint;
+                torque[column - 6] + work - joint.stiffness * (robot.start.q[column - 6] - joint.rest)
+            };
+            assert!(balance.abs() < 1e-9, "{name}, column {column}: {balance:e}");
+        }
+    }
 }
