@@ -82,6 +82,33 @@ use row_product::SparseRows;
 const DEPENDENT_ROW: f64 = 1e-12;
 
 /// Workspace of one stage of a floating robot, allocated once for a tree, a rule and all contacts the robot may have.
+///
+/// Stages of a horizon are independent of each other. Linearised one after the other, neighbours share the kinematics of the boundary
+/// between them; threads take a clone each.
+///
+/// # Example
+/// A trunk balanced on one leg with a flat foot:
+/// ```
+/// use delmpc_mechanics::contact_stage::{BoundaryState, Contact, ContactStage};
+/// use delmpc_mechanics::prelude::*;
+/// let trunk = LinkInertia::new(2.0, Vector3::zeros(), Matrix3::identity() * 0.01);
+/// let mut builder = TreeBuilder::floating_base(Vector3::new(0.0, 0.0, -9.81), trunk);
+/// let leg = LinkInertia::new(1.0, Vector3::new(0.0, 0.0, -0.2), Matrix3::identity() * 0.004);
+/// let hip = Joint::revolute(Vector3::y(), RigidTransform::identity());
+/// let shank = builder.add(Body::new(Some(0), hip, leg));
+/// let tree = builder.build()?;
+/// let foot = Contact::foot(shank, Vector3::new(0.0, 0.0, -0.4), Matrix3::identity());
+/// let mut stage = ContactStage::new(&tree, &LobattoRule::new(2)?, &[foot])?;
+/// let (mut nominal, mut lifted) = (stage.nominal(), stage.lifted());
+/// let start = BoundaryState::zeros(&tree);
+/// let mut end = start.clone();
+/// let (dt, u) = (0.02, [0.0]);
+/// stage.solve(&tree, dt, &[true], &start, &u, &mut nominal, &mut end)?;
+/// stage.linearize(&tree, dt, &[true], &start, &nominal, &u, &end, &mut lifted)?;
+/// let weight = 3.0 * 9.81;
+/// assert!((lifted.force_row(5)[0] - weight).abs() < 1e-9); // last row of the foot: normal force
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct ContactStage {
     contacts: Vec<Contact>,
@@ -259,6 +286,8 @@ impl ContactStage {
         end: &BoundaryState,
         out: &mut LiftedStage,
     ) -> Result<(), StepError> {
+        nominal.check(self.del.unknown_nodes(), tree.joint_count(), self.row_count())?;
+        out.check(self)?;
         self.begin(tree, time_step, active, start, u)?;
         self.end.update(tree, end)?;
         self.place_nodes(tree, nominal)?;

@@ -435,6 +435,22 @@ fn bad_input_is_refused_with_its_name() {
     let mut bad = robot.start.clone();
     bad.rate[3] = f64::NAN;
     assert!(solve(0.01, &ALL, &bad, &robot.u).contains("joint rate is not finite at index 3"));
+    let other = quadruped_on(&ALL, Forces::None).stage(3);
+    let mut wrong = other.nominal();
+    let refused = stage.solve(&robot.tree, 0.01, &ALL, &robot.start, &robot.u, &mut wrong, &mut end);
+    assert!(refused.unwrap_err().to_string().contains("nodes of the nominal"));
+    let nominal = stage.nominal();
+    let refused = stage.linearize(
+        &robot.tree,
+        0.01,
+        &ALL,
+        &robot.start,
+        &nominal,
+        &robot.u,
+        &end,
+        &mut ContactStage::new(&robot.tree, &LobattoRule::new(2).unwrap(), &[]).unwrap().lifted(),
+    );
+    assert!(refused.unwrap_err().to_string().contains("of the lifted stage"));
     let double = [robot.contacts[0], robot.contacts[0]];
     let mut stage = ContactStage::new(&robot.tree, &LobattoRule::new(2).unwrap(), &double).unwrap();
     let mut nominal = stage.nominal();

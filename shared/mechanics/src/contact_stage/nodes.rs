@@ -56,9 +56,6 @@ impl ContactStage {
         nominal: &StageNominal,
     ) -> Result<(), StepError> {
         let (s, joints) = (self.del.unknown_nodes(), tree.joint_count());
-        check_length("base nodes of the nominal", nominal.xi.len(), 6 * s)?;
-        check_length("joint nodes of the nominal", nominal.q.len(), joints * s)?;
-        check_length("multipliers of the nominal", nominal.multipliers.len(), (s + 1) * self.row_count())?;
         for alpha in 1..=s {
             for k in 0..6 {
                 self.del.set_node(alpha, k, nominal.xi[(alpha - 1) * 6 + k]);
