@@ -48,6 +48,7 @@ use crate::branch_lu::BranchLu;
 use crate::del_residual::{DelWorkspace, ForceCapacity, HeldTorque};
 use crate::dense_lu::DenseLu;
 use crate::errors::{ModelError, StepError};
+use crate::kinematics::check_length;
 use crate::lanes::Quad;
 use crate::lobatto::LobattoRule;
 use crate::row_matrix::RowMatrix;
@@ -297,6 +298,29 @@ impl ContactStage {
         self.solve_saddle(tree, true)?;
         self.end_rows(tree, end)?;
         self.write(nominal, out);
+        Ok(())
+    }
+
+    /// The DEL residual at the nodes last evaluated, entry `dof * s + α`, base first.
+    pub fn residual(&self) -> &[f64] {
+        &self.residual
+    }
+
+    /// How far node `gamma` (1..=s) is off the leaf through the start, active row by row (m, or rad for small turns): `h^γ`.
+    ///
+    /// # Errors
+    /// [`ModelError::Length`] for a node that does not exist or a slice that is not as long as there are active rows.
+    pub fn leaf_defect_into(&self, gamma: usize, out: &mut [f64]) -> Result<(), ModelError> {
+        check_length("leaf defects", out.len(), self.active.len())?;
+        let first = gamma * self.contacts.len();
+        let Some(placements) = self.placements.get(first..first + self.contacts.len()) else {
+            let expected = self.del.unknown_nodes();
+            return Err(ModelError::Length { quantity: "nodes", got: gamma, expected });
+        };
+        for (active, value) in self.active.iter().zip(out) {
+            let index = active.contact;
+            *value = placements[index].defect(&self.contacts[index], &self.placements[index], active.row);
+        }
         Ok(())
     }
 

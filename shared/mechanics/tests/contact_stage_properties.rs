@@ -6,7 +6,7 @@ mod contact_robots;
 mod oracle;
 mod sample_robots;
 
-use contact_robots::{Robot, a, arms_on_a_foot, atlas, b, local, moved, quadruped_on, relative};
+use contact_robots::{Robot, a, arms_on_a_foot, atlas, b, canonical, local, moved, quadruped_on, relative};
 use delmpc_mechanics::contact_stage::{BoundaryKinematics, BoundaryState, Contact, ContactStage};
 use delmpc_mechanics::prelude::*;
 use delmpc_mechanics::spatial::{exp_rotation, log_rotation};
@@ -79,31 +79,6 @@ fn the_stage_has_order_four() {
     }
 }
 
-/// `(ε, δq, δV, δq̇) -> (ε, δq, δπ, δp_j)`.
-fn canonical(robot: &Robot, state: &BoundaryState) -> DMatrix<f64> {
-    let (nv, joints) = (robot.tree.dof(), robot.tree.joint_count());
-    let boundary = robot.boundary(state);
-    let mut map = DMatrix::identity(2 * nv, 2 * nv);
-    let gradient = boundary.momentum_gradient();
-    let momentum = boundary.base_pose_w().inverse_transform_wrench(&boundary.momentum_w());
-    for r in 0..nv {
-        for c in 0..nv {
-            map[(nv + r, nv + c)] = boundary.mass_matrix()[r * nv + c];
-        }
-        for j in 0..joints {
-            map[(nv + r, 6 + j)] = gradient[r * joints + j];
-        }
-    }
-    for k in 0..6 {
-        let unit = Twist::from_vector(&Vector6::ith(k, 1.0));
-        let half = momentum.dual_bracket(&unit).to_vector() * -0.5;
-        for r in 0..6 {
-            map[(nv + r, k)] = half[r];
-        }
-    }
-    map
-}
-
 /// A basis of the kernel of the rows.
 fn kernel(rows: &DMatrix<f64>) -> DMatrix<f64> {
     let n = rows.ncols();
@@ -134,8 +109,8 @@ fn the_stage_is_symplectic_on_the_manifold() {
             omega[(k, nv + k)] = 1.0;
             omega[(nv + k, k)] = -1.0;
         }
-        let before = canonical(&robot, &robot.start) * &basis;
-        let after = canonical(&robot, &end) * a(&lifted) * &basis;
+        let before = canonical(&robot.tree, &robot.start) * &basis;
+        let after = canonical(&robot.tree, &end) * a(&lifted) * &basis;
         let (before, after) = (before.transpose() * &omega * &before, after.transpose() * &omega * &after);
         let defect = (&after - &before).amax() / before.amax();
         println!("{name}, s = {s}: {defect:.1e}");
@@ -318,10 +293,10 @@ fn without_active_contacts_it_is_the_step_of_the_integrator_bit_for_bit() {
     let linear = work.linearize(&robot.tree, &mut integrator).unwrap();
     let n = 2 * robot.tree.dof();
     let want = DMatrix::from_fn(n, n, |r, c| linear.a(r, c));
-    let back = canonical(&robot, &robot.start).lu().try_inverse().unwrap();
-    let got = canonical(&robot, &end) * a(&lifted) * back;
+    let back = canonical(&robot.tree, &robot.start).lu().try_inverse().unwrap();
+    let got = canonical(&robot.tree, &end) * a(&lifted) * back;
     let want_b = DMatrix::from_fn(n, robot.tree.joint_count(), |r, c| linear.b(r, c));
-    let errors = [relative(&got, &want), relative(&(canonical(&robot, &end) * b(&lifted)), &want_b)];
+    let errors = [relative(&got, &want), relative(&(canonical(&robot.tree, &end) * b(&lifted)), &want_b)];
     assert!(errors.iter().all(|e| *e < 1e-11), "{errors:?}");
 }
 

@@ -217,6 +217,32 @@ impl Robot {
     }
 }
 
+/// `(ε, δq, δV, δq̇) -> (ε, δq, δπ, δp_j)`.
+pub fn canonical(tree: &KinematicTree, state: &BoundaryState) -> DMatrix<f64> {
+    let (nv, joints) = (tree.dof(), tree.joint_count());
+    let mut boundary = BoundaryKinematics::new(tree).unwrap();
+    boundary.update(tree, state).unwrap();
+    let mut map = DMatrix::identity(2 * nv, 2 * nv);
+    let gradient = boundary.momentum_gradient();
+    let momentum = boundary.base_pose_w().inverse_transform_wrench(&boundary.momentum_w());
+    for r in 0..nv {
+        for c in 0..nv {
+            map[(nv + r, nv + c)] = boundary.mass_matrix()[r * nv + c];
+        }
+        for j in 0..joints {
+            map[(nv + r, 6 + j)] = gradient[r * joints + j];
+        }
+    }
+    for k in 0..6 {
+        let unit = Twist::from_vector(&Vector6::ith(k, 1.0));
+        let half = momentum.dual_bracket(&unit).to_vector() * -0.5;
+        for r in 0..6 {
+            map[(nv + r, k)] = half[r];
+        }
+    }
+    map
+}
+
 pub fn a(lifted: &LiftedStage) -> DMatrix<f64> {
     let n = 2 * lifted.dof();
     DMatrix::from_fn(n, n, |r, c| lifted.a(r, c))
