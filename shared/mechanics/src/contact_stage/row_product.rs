@@ -14,20 +14,32 @@ pub(super) struct SparseRows {
     factors: Vec<f64>,
     /// Entries filled.
     filled: usize,
+    /// First rows of groups of up to [`GROUP`] rows that take from the same sources: what they load is loaded once.
+    groups: Vec<u32>,
 }
+
+/// Rows that a kernel fills at a time.
+const GROUP: usize = 4;
 
 impl SparseRows {
     /// Room for `rows` rows with `entries` entries in all.
     pub fn new(rows: usize, entries: usize) -> Self {
         let mut starts = Vec::with_capacity(rows + 1);
         starts.push(0);
-        Self { starts, sources: Vec::with_capacity(entries), factors: Vec::with_capacity(entries), filled: 0 }
+        Self {
+            starts,
+            sources: Vec::with_capacity(entries),
+            factors: Vec::with_capacity(entries),
+            filled: 0,
+            groups: Vec::with_capacity(rows),
+        }
     }
 
     pub fn clear(&mut self) {
         self.starts.truncate(1);
         self.sources.clear();
         self.factors.clear();
+        self.groups.clear();
     }
 
     /// An entry of the row that is being filled.
@@ -40,7 +52,20 @@ impl SparseRows {
     /// Ends the row that is being filled.
     #[inline(always)]
     pub fn end_row(&mut self) {
+        let row = self.starts.len() - 1;
         self.starts.push(self.sources.len() as u32);
+        let joins = self.groups.last().is_some_and(|&first| {
+            let first = first as usize;
+            row - first < GROUP && self.sources_of(first) == self.sources_of(row)
+        });
+        if !joins {
+            self.groups.push(row as u32);
+        }
+    }
+
+    #[inline(always)]
+    fn sources_of(&self, row: usize) -> &[u32] {
+        &self.sources[self.starts[row] as usize..self.starts[row + 1] as usize]
     }
 
     /// Begins to fill in new factors of the entries that are there, by [`SparseRows::refill`] in the order of the pushes.
@@ -84,31 +109,57 @@ impl Kernel for AddProduct<'_> {
 /// `W` pieces of the columns from `at` on.
 #[inline(always)]
 fn add_product_at<S: Simd, const W: usize>(simd: S, work: &mut AddProduct<'_>, at: usize) {
-    let (from, to) = (work.source.stride() / WIDE, work.target.stride() / WIDE);
+    let rows = work.matrix.starts.len() - 1;
+    let groups = &work.matrix.groups;
+    for (k, &first) in groups.iter().enumerate() {
+        let first = first as usize;
+        let end = groups.get(k + 1).map_or(rows, |&next| next as usize);
+        match end - first {
+            4 => add_group_at::<S, W, 4>(simd, work, first, at),
+            3 => add_group_at::<S, W, 3>(simd, work, first, at),
+            2 => add_group_at::<S, W, 2>(simd, work, first, at),
+            _ => add_group_at::<S, W, 1>(simd, work, first, at),
+        }
+    }
+}
+
+/// `R` rows from `row` on, which take from the same sources.
+#[inline(always)]
+fn add_group_at<S: Simd, const W: usize, const R: usize>(
+    simd: S,
+    work: &mut AddProduct<'_>,
+    row: usize,
+    at: usize,
+) {
+    let AddProduct { matrix, source, target, first } = work;
+    let (from, to) = (source.stride() / WIDE, target.stride() / WIDE);
+    let source = source.pieces();
+    let target = target.pieces_mut();
+    let sources = matrix.sources_of(row);
+    let count = sources.len();
+    if count == 0 {
+        return;
+    }
+    let factors = &matrix.factors[matrix.starts[row] as usize..][..R * count];
     let one = WideLane::splat(simd, 1.0);
-    let source = work.source.pieces();
-    let target = work.target.pieces_mut();
-    for (row, range) in work.matrix.starts.windows(2).enumerate() {
-        let range = range[0] as usize..range[1] as usize;
-        if range.is_empty() {
-            continue;
-        }
-        let first = (work.first + row) * to + at;
-        // Two sums hide the latency of the multiply-add.
-        let mut even = [WideLane::splat(simd, 0.0); W];
-        let mut odd = even;
-        let (sources, last_source) = work.matrix.sources[range.clone()].as_chunks::<2>();
-        let (factors, last_factor) = work.matrix.factors[range].as_chunks::<2>();
-        for (&[r, q], &[a, b]) in sources.iter().zip(factors) {
-            add_scaled(simd, &mut even, a, source, r as usize * from + at);
-            add_scaled(simd, &mut odd, b, source, q as usize * from + at);
-        }
-        for (&r, &a) in last_source.iter().zip(last_factor) {
-            add_scaled(simd, &mut even, a, source, r as usize * from + at);
-        }
+    let mut sums = [[WideLane::splat(simd, 0.0); W]; R];
+    for (entry, &r) in sources.iter().enumerate() {
+        let pieces = &source[r as usize * from + at..][..W];
+        let mut x = [one; W];
         for w in 0..W {
-            let own = one.mul_add(even[w], WideLane::of(simd, &target[first + w]));
-            target[first + w] = one.mul_add(odd[w], own).quads();
+            x[w] = WideLane::of(simd, &pieces[w]);
+        }
+        for k in 0..R {
+            let factor = WideLane::splat(simd, factors[k * count + entry]);
+            for w in 0..W {
+                sums[k][w] = factor.mul_add(x[w], sums[k][w]);
+            }
+        }
+    }
+    for k in 0..R {
+        let own = &mut target[(*first + row + k) * to + at..][..W];
+        for w in 0..W {
+            own[w] = one.mul_add(sums[k][w], WideLane::of(simd, &own[w])).quads();
         }
     }
 }
