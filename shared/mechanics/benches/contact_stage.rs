@@ -1,6 +1,7 @@
 //! Time of the lifted linearisation of a stage with contacts beside that of the same robot rooted at its foot (in the stage batch).
 //!
-//! `cargo bench -p delmpc-mechanics --bench contact_stage`. Every figure is the median of many calls, in brackets the fastest tenth.
+//! `cargo bench -p delmpc-mechanics --bench contact_stage [-- --profile atlas|quadruped]`; `--profile` only runs one stage on all feet,
+//! for a profiler. Every figure is the median of many calls, in brackets the fastest tenth.
 //! Times depend on the machine: quote the ratios.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
@@ -79,16 +80,19 @@ fn contacts(name: &str, robot: &Robot, active: &[bool], of_batch: &[f64; 2]) {
 
 fn main() {
     let atlas = atlas();
+    let quadruped = quadruped_on(&[true; 4], Forces::None);
+    let arguments: Vec<String> = std::env::args().collect();
+    if let Some(at) = arguments.iter().position(|a| a == "--profile") {
+        let small = arguments.get(at + 1).is_some_and(|name| name == "quadruped");
+        let robot = if small { &quadruped } else { &atlas.robot };
+        return (0..10).for_each(|_| contacts("profile", robot, &robot.active, &[1.0; 2]));
+    }
     let of_batch = batch(atlas.rooted.tree());
     println!("Atlas on its foot, in a batch: {:.1} ({:.1}) µs per stage", of_batch[0], of_batch[1]);
     for active in [[false, false], [true, false], [true, true]] {
         contacts("Atlas", &atlas.robot, &active, &of_batch);
     }
-    let quadruped = quadruped_on(&[true; 4], Forces::None);
     for active in [[false; 4], [true, false, false, true], [true; 4]] {
         contacts("quadruped", &quadruped, &active, &of_batch);
-    }
-    if std::env::args().any(|a| a == "--profile") {
-        contacts("Atlas", &atlas.robot, &[true, true], &of_batch);
     }
 }

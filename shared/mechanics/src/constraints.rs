@@ -32,8 +32,8 @@
 //! δλ^s = -(G M⁻¹ Gᵀ)⁻¹ [ G M⁻¹ δp_raw + ( ∂(Gv)/∂q - G M⁻¹ ∂(Mv)/∂q ) δq^s ]          (δp_raw with W^s δq^s)
 //! ```
 //!
-//! Limits: fixed base; rows must be independent (a planar four-bar needs 2 rows of its loop, not 3): dependent rows are refused by
-//! their index, drop them with [`Constraint::rows`].
+//! Limits: fixed base (contacts of a floating one: [`crate::contact_stage`]); rows must be independent (a planar four-bar needs 2 rows
+//! of its loop, not 3): dependent rows are refused by their index, drop them with [`Constraint::rows`].
 //!
 //! Source: the paper, section 3.3; H. C. Andersen, *Rattle*, J. Comput. Phys. 52, 1983; order and symplecticity: L. O. Jay,
 //! SIAM J. Numer. Anal. 33, 1996. End-node multiplier for the Galerkin form and its linearisation: ours.

@@ -48,13 +48,14 @@ use crate::branch_lu::BranchLu;
 use crate::del_residual::{DelWorkspace, ForceCapacity, HeldTorque};
 use crate::dense_lu::DenseLu;
 use crate::errors::{ModelError, StepError};
+use crate::kinematics::check_length;
 use crate::lanes::Quad;
 use crate::lobatto::LobattoRule;
 use crate::row_matrix::RowMatrix;
 use crate::state::State;
 use crate::step::{Integrator, StepOptions};
 use crate::tree::KinematicTree;
-use nalgebra::Matrix3;
+use nalgebra::{Matrix3, Vector6};
 
 mod boundary_kinematics;
 mod boundary_state;
@@ -82,6 +83,33 @@ use row_product::SparseRows;
 const DEPENDENT_ROW: f64 = 1e-12;
 
 /// Workspace of one stage of a floating robot, allocated once for a tree, a rule and all contacts the robot may have.
+///
+/// Stages of a horizon are independent of each other. Linearised one after the other, neighbours share the kinematics of the boundary
+/// between them; threads take a clone each.
+///
+/// # Example
+/// A trunk balanced on one leg with a flat foot:
+/// ```
+/// use delmpc_mechanics::contact_stage::{BoundaryState, Contact, ContactStage};
+/// use delmpc_mechanics::prelude::*;
+/// let trunk = LinkInertia::new(2.0, Vector3::zeros(), Matrix3::identity() * 0.01);
+/// let mut builder = TreeBuilder::floating_base(Vector3::new(0.0, 0.0, -9.81), trunk);
+/// let leg = LinkInertia::new(1.0, Vector3::new(0.0, 0.0, -0.2), Matrix3::identity() * 0.004);
+/// let hip = Joint::revolute(Vector3::y(), RigidTransform::identity());
+/// let shank = builder.add(Body::new(Some(0), hip, leg));
+/// let tree = builder.build()?;
+/// let foot = Contact::foot(shank, Vector3::new(0.0, 0.0, -0.4), Matrix3::identity());
+/// let mut stage = ContactStage::new(&tree, &LobattoRule::new(2)?, &[foot])?;
+/// let (mut nominal, mut lifted) = (stage.nominal(), stage.lifted());
+/// let start = BoundaryState::zeros(&tree);
+/// let mut end = start.clone();
+/// let (dt, u) = (0.02, [0.0]);
+/// stage.solve(&tree, dt, &[true], &start, &u, &mut nominal, &mut end)?;
+/// stage.linearize(&tree, dt, &[true], &start, &nominal, &u, &end, &mut lifted)?;
+/// let weight = 3.0 * 9.81;
+/// assert!((lifted.force_row(5)[0] - weight).abs() < 1e-9); // last row of the foot: normal force
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct ContactStage {
     contacts: Vec<Contact>,
@@ -99,8 +127,8 @@ pub struct ContactStage {
     active: Vec<ActiveRow>,
     /// `[node * contacts + contact]`.
     placements: Vec<Placement>,
-    /// Derivatives of the momenta by `q` at a boundary: `nv x joints`.
-    momentum_gradient: Vec<f64>,
+    /// Change of the momentum at the end, in base axes there, by node γ: `[dof (s + 1) + γ]`.
+    impulses: Vec<Vector6<f64>>,
     /// `[1 | x | u]` right-hand sides, then `𝒜`; row `dof * s + node`.
     columns: RowMatrix,
     /// `𝒢Z + h`, then `δΛ`: row `(γ - 1) * m + row`, or `α * m + row`.
@@ -108,6 +136,8 @@ pub struct ContactStage {
     /// `x'_raw`, then `x_{k+1}`.
     ends: RowMatrix,
     end_multipliers: RowMatrix,
+    /// `𝓜⁻¹G_s^T` in the lower `nv` rows.
+    end_responses: RowMatrix,
     schur: DenseLu,
     /// `X = J⁻¹𝒜`, row-major.
     responses: Vec<f64>,
@@ -145,9 +175,7 @@ impl ContactStage {
         }
         let m = first_rows[contacts.len()];
         let (nv, nu, s) = (tree.dof(), tree.joint_count(), rule.unknown_nodes());
-        let capacity =
-            ForceCapacity { points: 0, laws: contacts.iter().any(|c| c.kind == ContactKind::Foot) };
-        let mut del = DelWorkspace::with_loads(tree, rule, 1.0, capacity, contacts.len())?;
+        let mut del = DelWorkspace::with_loads(tree, rule, 1.0, ForceCapacity::default(), contacts.len())?;
         for contact in contacts.iter().filter(|c| c.kind == ContactKind::Foot) {
             let torque_w = vec![[Quad::ZERO; 3]; del.groups];
             del.held_torques.push(HeldTorque { body: contact.body, torque_w });
@@ -168,15 +196,16 @@ impl ContactStage {
             state: State::zeros(tree),
             active: Vec::with_capacity(m),
             placements: vec![Placement::none(); (s + 1) * contacts.len()],
-            momentum_gradient: vec![0.0; nv * nu],
+            impulses: vec![Vector6::zeros(); nv * (s + 1)],
             columns: RowMatrix::zeros(s * nv, columns + s * m),
             multipliers: RowMatrix::zeros(s * m, columns + s * m),
             ends: RowMatrix::zeros(2 * nv, columns),
             end_multipliers: RowMatrix::zeros(m, columns),
+            end_responses: RowMatrix::zeros(2 * nv, m),
             schur: DenseLu::new(s * m),
             responses: vec![0.0; s * nv * (s * m).max(1)],
             gradient: SparseRows::new(s * m, s * m * (12 + longest)),
-            end_of_nodes: SparseRows::new(2 * nv, 36 + nv + s * (12 * nv + relatives.len())),
+            end_of_nodes: end::end_pattern(&relatives, nv, s),
             end_of_multipliers: SparseRows::new(m.max(6), 6 * s * m + 2 * m * longest),
             relatives,
             velocity_gradient: vec![0.0; MAX_ROWS * nv],
@@ -234,6 +263,13 @@ impl ContactStage {
         LiftedStage::new(nv, nv - 6, self.del.unknown_nodes(), self.contacts.len(), self.row_count())
     }
 
+    /// The same without the maps of the nodes, for those who place the nodes otherwise ([`StageNominal::interpolate`]).
+    pub fn lifted_without_nodes(&self) -> LiftedStage {
+        let mut lifted = self.lifted();
+        lifted.nodes = Vec::new();
+        lifted
+    }
+
     /// Linearises the unsolved stage between `start` and `end` about `nominal` under held joint forces `u` (N·m or N). No allocation.
     ///
     /// # Errors
@@ -251,15 +287,40 @@ impl ContactStage {
         end: &BoundaryState,
         out: &mut LiftedStage,
     ) -> Result<(), StepError> {
+        nominal.check(self.del.unknown_nodes(), tree.joint_count(), self.row_count())?;
+        out.check(self)?;
         self.begin(tree, time_step, active, start, u)?;
         self.end.update(tree, end)?;
-        self.projection.factor(tree, &self.end, &self.contacts, active, self.regularisation)?;
         self.place_nodes(tree, nominal)?;
+        self.factor_end_responses(tree, active)?;
         self.solver_factor(tree)?;
-        self.fill_columns(tree)?;
+        self.fill_columns(tree);
         self.solve_saddle(tree, true)?;
         self.end_rows(tree, end)?;
         self.write(nominal, out);
+        Ok(())
+    }
+
+    /// The DEL residual at the nodes last evaluated, entry `dof * s + α`, base first.
+    pub fn residual(&self) -> &[f64] {
+        &self.residual
+    }
+
+    /// How far node `gamma` (1..=s) is off the leaf through the start, active row by row (m, or rad for small turns): `h^γ`.
+    ///
+    /// # Errors
+    /// [`ModelError::Length`] for a node that does not exist or a slice that is not as long as there are active rows.
+    pub fn leaf_defect_into(&self, gamma: usize, out: &mut [f64]) -> Result<(), ModelError> {
+        check_length("leaf defects", out.len(), self.active.len())?;
+        let first = gamma * self.contacts.len();
+        let Some(placements) = self.placements.get(first..first + self.contacts.len()) else {
+            let expected = self.del.unknown_nodes();
+            return Err(ModelError::Length { quantity: "nodes", got: gamma, expected });
+        };
+        for (active, value) in self.active.iter().zip(out) {
+            let index = active.contact;
+            *value = placements[index].defect(&self.contacts[index], &self.placements[index], active.row);
+        }
         Ok(())
     }
 

@@ -44,10 +44,11 @@ use crate::tree::KinematicTree;
 mod composites;
 mod entries;
 mod pairs;
+mod skew;
 
 use composites::{Assemble, BasePairs, Composites};
-use entries::lane;
 pub(crate) use entries::{JointAndBase, PairBlock};
+use entries::{lane, skew};
 
 /// What a column coordinate (a joint or one base coordinate) brings to its pairs.
 #[derive(Clone, Copy, Debug, Default)]
@@ -119,6 +120,9 @@ pub struct DelHessian {
     blocks: Vec<Quad>,
     /// `H_ji`, likewise; empty when `H_ji[α,γ] = H_ij[γ,α]`.
     mirror: Vec<Quad>,
+    /// `w_α Δt s_i·(τ×s_j)` of the torques held in {0} on the subtree of i (lanes over α): what `H_ji[α,α]` has less than `H_ij[α,α]`;
+    /// `[pair groups + g]`, empty without such torques.
+    skew: Vec<Quad>,
     /// Base-base blocks, pairs `k * 6 + l`.
     base_blocks: Vec<Quad>,
     /// `S_iᵀ 𝒴_i w_α Δt` of every body with a joint, then six rows of the base: `[row groups + g]`.
@@ -163,6 +167,7 @@ impl DelHessian {
             pair_starts,
             blocks: vec![Quad::ZERO; pairs * block],
             mirror: vec![Quad::ZERO; if del.gains.is_empty() { 0 } else { pairs * block }],
+            skew: vec![Quad::ZERO; if del.dead_torques().is_empty() { 0 } else { pairs * groups }],
             base_blocks: vec![Quad::ZERO; if floating { 36 * block } else { 0 }],
             shift_rows: vec![[Quad::ZERO; 6]; if floating { tree.dof() * groups } else { 0 }],
             impulse_columns: vec![[Quad::ZERO; 6]; if floating { tree.dof() * groups } else { 0 }],
@@ -181,6 +186,9 @@ impl DelHessian {
         del.instructions.dispatch(Assemble { tree, del, hessian: self });
         if tree.is_floating() {
             del.instructions.dispatch(BasePairs { tree, del, hessian: self });
+        }
+        if !self.skew.is_empty() {
+            self.evaluate_skew(tree, del);
         }
     }
 
@@ -224,7 +232,11 @@ impl DelHessian {
         let symmetric = self.mirror.is_empty();
         let mirror = if symmetric { &self.blocks } else { &self.mirror };
         let pairs = self.blocks[quads.clone()].chunks_exact(block).zip(mirror[quads].chunks_exact(block));
-        pairs.map(move |(own, mirror)| PairBlock { own, mirror, symmetric, groups })
+        let first = self.pair_starts[body];
+        pairs.enumerate().map(move |(place, (own, mirror))| {
+            let skew = self.skew_of(first + place, 1, groups);
+            PairBlock { own, mirror, symmetric, groups, skew }
+        })
     }
 
     /// `H[α,γ]` for the joint coordinate of `body` (row) and coordinate `position` of its branch (column).
@@ -237,7 +249,7 @@ impl DelHessian {
     #[inline(always)]
     pub(crate) fn mirrored(&self, pair: usize, alpha: usize, gamma: usize) -> f64 {
         if self.mirror.is_empty() {
-            self.entry(pair, gamma, alpha)
+            self.entry(pair, gamma, alpha) - skew(self.skew_of(pair, 1, self.groups), alpha, gamma)
         } else {
             self.mirror[(pair * (self.s + 1) + alpha) * self.groups + gamma / LANES].0[gamma % LANES]
         }
@@ -291,7 +303,14 @@ impl DelHessian {
             impulses: &self.impulses_on_base[dof * groups..(dof + 1) * groups],
             s,
             groups,
+            skew: self.skew_of(self.pair_starts[body], 6, groups),
         }
+    }
+
+    /// The asymmetric parts of `count` pairs; empty without held torques.
+    #[inline(always)]
+    pub(crate) fn skew_of(&self, pair: usize, count: usize, groups: usize) -> &[Quad] {
+        if self.skew.is_empty() { &[] } else { &self.skew[pair * groups..(pair + count) * groups] }
     }
 
     /// `(𝒴 - ad^D_Γ)^α e_k` of the base, times `w_α Δt`.

@@ -33,9 +33,11 @@ use crate::spatial::{RigidTransform, Twist, Wrench, exp_rotation};
 use crate::state::State;
 use crate::tree::KinematicTree;
 
+mod held_torque;
 mod inward;
 mod outward;
 
+pub(crate) use held_torque::HeldTorque;
 use inward::Inward;
 pub(crate) use inward::{load_arm, weighted_sum};
 use outward::Outward;
@@ -61,15 +63,6 @@ pub(crate) struct DeadLoad {
     pub arm_b: [f64; 3],
     /// A couple `arm × f` without resultant force, instead of a force at the point.
     pub couple: bool,
-}
-
-/// A torque that keeps its direction in {0} (foot contact). Its gain `τ×η_ω` is not symmetric: it goes with the laws, so the workspace
-/// needs [`ForceCapacity::laws`].
-#[derive(Clone, Debug)]
-pub(crate) struct HeldTorque {
-    pub body: usize,
-    /// N·m at the nodes: one 3-vector per lane group.
-    pub torque_w: Vec<[Quad; 3]>,
 }
 
 /// Wrench of the laws on one body and its gains, at the nodes of one lane group.
@@ -489,21 +482,7 @@ impl DelWorkspace {
                 add_matrix(&mut gain.nu, &answer.d_velocity, lane);
             }
         }
-        for held in &self.held_torques {
-            for (g, [x, y, z]) in held.torque_w.iter().enumerate() {
-                let gain = &mut self.gains[held.body * self.groups + g];
-                for lane in 0..LANES {
-                    let (x, y, z) = (x.0[lane], y.0[lane], z.0[lane]);
-                    for (k, value) in [x, y, z].into_iter().enumerate() {
-                        gain.wrench[k].0[lane] += value;
-                    }
-                    // τ^
-                    for (at, value) in [(1, -z), (2, y), (6, z), (8, -x), (12, -y), (13, x)] {
-                        gain.eta[at].0[lane] += value;
-                    }
-                }
-            }
-        }
+        self.add_torques_to_gains();
     }
 
     /// The DEL residual `r^α`, `α = 0..s-1`, coordinate-major: entry `dof * s + α`. O(s n).

@@ -43,6 +43,11 @@ impl DenseLu {
         self.order
     }
 
+    /// Row `row` of the factors.
+    pub(crate) fn row(&self, row: usize) -> &[f64] {
+        &self.entries[row * self.order..(row + 1) * self.order]
+    }
+
     /// Rows that the factorisation swapped: row k with `swaps()[k]`, in this order.
     pub(crate) fn swaps(&self) -> &[usize] {
         &self.pivots

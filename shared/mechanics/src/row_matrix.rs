@@ -99,6 +99,15 @@ impl RowMatrix {
         &mut self.data[self.first..]
     }
 
+    /// Copies the entries of a row from column `first` on.
+    #[inline(always)]
+    pub(crate) fn copy_part(&self, row: usize, first: usize, out: &mut [f64]) {
+        let quads = &self.quads()[row * self.stride..(row + 1) * self.stride];
+        for (k, value) in out.iter_mut().enumerate() {
+            *value = quads[(first + k) / LANES].0[(first + k) % LANES];
+        }
+    }
+
     /// Copies the entries row by row into a plain slice of `rows * columns`.
     pub fn copy_to(&self, out: &mut [f64]) {
         for (row, target) in out.chunks_exact_mut(self.columns).enumerate() {

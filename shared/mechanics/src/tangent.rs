@@ -347,6 +347,16 @@ fn load_variations<S: Simd>(simd: S, del: &DelWorkspace, work: &mut TangentWorks
             lanes.d_impulse = store(scale_add(step, change, load(simd, &lanes.d_impulse)));
         }
     }
+    for held in del.dead_torques() {
+        for g in 0..groups {
+            let lanes = &mut work.bodies[held.body * groups + g];
+            let turned = cross(load(simd, &held.torque_w[g]), halves(load(simd, &lanes.eta)).0);
+            let step = Lane::load(simd, &del.weights[g]);
+            for k in 0..3 {
+                lanes.d_impulse[k] = step.mul_add(turned[k], Lane::load(simd, &lanes.d_impulse[k])).quad();
+            }
+        }
+    }
 }
 
 #[inline(always)]

@@ -1,13 +1,17 @@
 //! The stage with contacts against the oracle vectors: boundary rows, solved step, `A`, `B`, forces, and the lifted stage.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+mod contact_robots;
 mod oracle;
+mod sample_robots;
 
+use contact_robots::canonical;
 use delmpc_mechanics::contact_stage::{
     BoundaryKinematics, BoundaryState, Contact, ContactKind, ContactProjection, ContactStage, LiftedStage,
     StageNominal,
 };
 use delmpc_mechanics::prelude::*;
+use nalgebra::DMatrix;
 use oracle::{assert_close, cases, flat, matrix3, model, vector3};
 use serde_json::Value;
 
@@ -170,7 +174,7 @@ fn boundary_rows_match_the_vectors() {
         assert_close(&format!("{name} dy"), &gradient, &flat(&want["dy_dconf"]), 1e-12);
         assert_close(&format!("{name} M"), boundary.mass_matrix(), &flat(&want["M_body"]), 1e-12);
         let mut state = State::zeros(tree);
-        boundary.state_into(&case.start.q, &mut state).unwrap();
+        boundary.state_into(&mut state).unwrap();
         let mut momenta = flat(&case.json["state0"]["P"]);
         momenta.extend(flat(&case.json["state0"]["pj"]));
         assert_close(&format!("{name} momenta"), &state.p, &momenta, 1e-12);
@@ -224,6 +228,13 @@ fn solved_stages_match_the_vectors() {
         assert_close(&format!("{name} force_u"), &part(1 + n, nu), &flat(&want["force_u"]), 1e-9);
         let d = (0..n).fold(0.0f64, |a, r| a.max(lifted.d(r).abs()));
         assert!(d < 1e-11, "{name} d {d:e}");
+        let map = |state: &BoundaryState| canonical(&case.tree, state);
+        let to_velocities = map(&case.start).lu().try_inverse().unwrap();
+        let [a, b] = [(a(&lifted), n), (b(&lifted), nu)]
+            .map(|(values, columns)| map(&end) * DMatrix::from_row_slice(n, columns, &values));
+        let a = (a * to_velocities).transpose();
+        case.compare("A canonical", a.as_slice(), &want["A_canonical"], n, &case.keep, 1e-9);
+        case.compare("B canonical", b.transpose().as_slice(), &want["B_canonical"], nu, &case.keep, 1e-9);
     }
 }
 
@@ -234,9 +245,18 @@ fn unsolved_stages_match_the_vectors() {
         let nominal = case.nominal(&want);
         let end = boundary(&want["end"], "");
         let lifted = case.linearize(&nominal, &end);
-        let want = &want["C"];
         let nv = case.tree.dof();
-        let (n, nu, m, s) = (2 * nv, case.tree.joint_count(), lifted.row_count(), lifted.unknown_nodes());
+        let (m, s) = (lifted.row_count(), lifted.unknown_nodes());
+        let name = &case.name;
+        let residual: Vec<f64> = (0..s * nv).map(|k| case.stage.residual()[k % nv * s + k / nv]).collect();
+        assert_close(&format!("{name} residual"), &residual, &flat(&want["residual"]), 1e-12);
+        let mut h = vec![0.0; s * m];
+        for (gamma, h) in h.chunks_exact_mut(m).enumerate() {
+            case.stage.leaf_defect_into(gamma + 1, h).unwrap();
+        }
+        assert_close(&format!("{name} h"), &h, &flat(&want["h"]), 1e-12);
+        let want = &want["C"];
+        let (n, nu) = (2 * nv, case.tree.joint_count());
         let columns = lifted.columns();
         case.compare("A", &a(&lifted), &want["A"], n, &case.keep, 1e-9);
         case.compare("B", &b(&lifted), &want["B"], nu, &case.keep, 1e-9);

@@ -6,10 +6,10 @@ mod contact_robots;
 mod oracle;
 mod sample_robots;
 
-use contact_robots::{Robot, a, atlas, b, local, moved, quadruped_on, relative};
-use delmpc_mechanics::contact_stage::{BoundaryState, Contact, ContactStage};
+use contact_robots::{Robot, a, arms_on_a_foot, atlas, b, canonical, local, moved, quadruped_on, relative};
+use delmpc_mechanics::contact_stage::{BoundaryKinematics, BoundaryState, Contact, ContactStage};
 use delmpc_mechanics::prelude::*;
-use delmpc_mechanics::spatial::exp_rotation;
+use delmpc_mechanics::spatial::{exp_rotation, log_rotation};
 use nalgebra::{DMatrix, DVector};
 use sample_robots::{Forces, difference};
 
@@ -79,32 +79,6 @@ fn the_stage_has_order_four() {
     }
 }
 
-/// `(ε, δq, δV, δq̇) -> (ε, δq, δπ, δp_j)`.
-fn canonical(robot: &Robot, state: &BoundaryState) -> DMatrix<f64> {
-    let (nv, joints) = (robot.tree.dof(), robot.tree.joint_count());
-    let boundary = robot.boundary(state);
-    let mut map = DMatrix::identity(2 * nv, 2 * nv);
-    let mut gradient = vec![0.0; nv * joints];
-    boundary.momentum_gradient_into(&robot.tree, &mut gradient).unwrap();
-    let momentum = boundary.base_pose_w().inverse_transform_wrench(&boundary.momentum_w());
-    for r in 0..nv {
-        for c in 0..nv {
-            map[(nv + r, nv + c)] = boundary.mass_matrix()[r * nv + c];
-        }
-        for j in 0..joints {
-            map[(nv + r, 6 + j)] = gradient[r * joints + j];
-        }
-    }
-    for k in 0..6 {
-        let unit = Twist::from_vector(&Vector6::ith(k, 1.0));
-        let half = momentum.dual_bracket(&unit).to_vector() * -0.5;
-        for r in 0..6 {
-            map[(nv + r, k)] = half[r];
-        }
-    }
-    map
-}
-
 /// A basis of the kernel of the rows.
 fn kernel(rows: &DMatrix<f64>) -> DMatrix<f64> {
     let n = rows.ncols();
@@ -119,9 +93,9 @@ fn kernel(rows: &DMatrix<f64>) -> DMatrix<f64> {
 
 #[test]
 fn the_stage_is_symplectic_on_the_manifold() {
-    for (name, robot) in robots() {
+    for ((name, robot), s) in robots().into_iter().flat_map(|robot| [1, 2, 3].map(|s| (robot.clone(), s))) {
         let nv = robot.tree.dof();
-        let (lifted, _, end) = robot.linear(&mut robot.stage(2), 0.01, &robot.start);
+        let (lifted, _, end) = robot.linear(&mut robot.stage(s), 0.01, &robot.start);
         let (g, gradient) = robot.rows(&robot.start);
         let m = g.nrows();
         let mut rows = DMatrix::zeros(2 * m, 2 * nv);
@@ -135,12 +109,12 @@ fn the_stage_is_symplectic_on_the_manifold() {
             omega[(k, nv + k)] = 1.0;
             omega[(nv + k, k)] = -1.0;
         }
-        let before = canonical(&robot, &robot.start) * &basis;
-        let after = canonical(&robot, &end) * a(&lifted) * &basis;
+        let before = canonical(&robot.tree, &robot.start) * &basis;
+        let after = canonical(&robot.tree, &end) * a(&lifted) * &basis;
         let (before, after) = (before.transpose() * &omega * &before, after.transpose() * &omega * &after);
         let defect = (&after - &before).amax() / before.amax();
-        println!("{name}: {defect:.1e}");
-        assert!(defect < 1e-11, "{name}: {defect:e}");
+        println!("{name}, s = {s}: {defect:.1e}");
+        assert!(defect < 1e-11, "{name}, s = {s}: {defect:e}");
     }
 }
 
@@ -215,7 +189,8 @@ fn difference_quotient(h: f64, mut value: impl FnMut(f64) -> Vec<f64>) -> DVecto
 
 #[test]
 fn a_and_b_of_a_touchdown_match_differences() {
-    for (name, robot) in robots() {
+    let dragged = ("arms with drag on a foot", arms_on_a_foot());
+    for (name, robot) in robots().into_iter().chain([dragged]) {
         let mut robot = touching_down(robot);
         // Wide: the hands of Atlas hardly have an inertia about their axes, their rates carry 1e-11 of round-off.
         let (dt, h, n) = (0.01, 1e-3, 2 * robot.tree.dof());
@@ -298,13 +273,13 @@ fn without_active_contacts_it_is_the_step_of_the_integrator_bit_for_bit() {
     let mut stage = robot.stage(2);
     let (_, end) = robot.solve(&mut stage, 0.01, &robot.start);
     let mut state = State::zeros(&robot.tree);
-    robot.boundary(&robot.start).state_into(&robot.start.q, &mut state).unwrap();
+    robot.boundary(&robot.start).state_into(&mut state).unwrap();
     let mut integrator = sample_robots::integrator(&robot.tree, 2, 0.01);
     integrator.step(&robot.tree, &mut state, &StepForces::held(&robot.u)).unwrap();
     assert_eq!(end.q, state.q);
     assert_eq!(end.base_pose_w(), state.base_pose);
     let mut momenta = State::zeros(&robot.tree);
-    robot.boundary(&end).state_into(&end.q, &mut momenta).unwrap();
+    robot.boundary(&end).state_into(&mut momenta).unwrap();
     assert!(difference(&momenta.p, &state.p) < 1e-13);
 
     // A, B against the linearisation of the floating base, in its coordinates.
@@ -312,16 +287,16 @@ fn without_active_contacts_it_is_the_step_of_the_integrator_bit_for_bit() {
     let mut work =
         Linearizer::new(&robot.tree, &integrator, StateCoordinates::Momentum, InputHold::Held).unwrap();
     let mut start = State::zeros(&robot.tree);
-    robot.boundary(&robot.start).state_into(&robot.start.q, &mut start).unwrap();
+    robot.boundary(&robot.start).state_into(&mut start).unwrap();
     integrator.forget();
     integrator.solve(&robot.tree, &start, &StepForces::held(&robot.u)).unwrap();
     let linear = work.linearize(&robot.tree, &mut integrator).unwrap();
     let n = 2 * robot.tree.dof();
     let want = DMatrix::from_fn(n, n, |r, c| linear.a(r, c));
-    let back = canonical(&robot, &robot.start).lu().try_inverse().unwrap();
-    let got = canonical(&robot, &end) * a(&lifted) * back;
+    let back = canonical(&robot.tree, &robot.start).lu().try_inverse().unwrap();
+    let got = canonical(&robot.tree, &end) * a(&lifted) * back;
     let want_b = DMatrix::from_fn(n, robot.tree.joint_count(), |r, c| linear.b(r, c));
-    let errors = [relative(&got, &want), relative(&(canonical(&robot, &end) * b(&lifted)), &want_b)];
+    let errors = [relative(&got, &want), relative(&(canonical(&robot.tree, &end) * b(&lifted)), &want_b)];
     assert!(errors.iter().all(|e| *e < 1e-11), "{errors:?}");
 }
 
@@ -360,11 +335,9 @@ fn a_lifted_horizon_converges_quadratically_to_the_stages_solved_one_by_one() {
     let mut states = vec![robot.start.clone()];
     for k in 0..stages {
         let mut x = vec![0.0; n];
-        for i in 0..6 {
-            x[i] = dt * states[k].base_velocity_b[i];
-        }
-        for i in 6..n / 2 {
-            x[i] = dt * states[k].rate[i - 6];
+        let velocity = states[k].base_velocity_b.iter().chain(&states[k].rate);
+        for (x, v) in x.iter_mut().zip(velocity) {
+            *x = dt * v;
         }
         states.push(moved(&states[k], &x));
     }
@@ -395,8 +368,8 @@ fn a_lifted_horizon_converges_quadratically_to_the_stages_solved_one_by_one() {
                 )
                 .unwrap();
             nominals[k].advance(&lifted, &x, &u);
-            let next: Vec<f64> =
-                (0..n).map(|r| lifted.d(r) + (0..n).map(|c| lifted.a(r, c) * x[c]).sum::<f64>()).collect();
+            let mut next = vec![0.0; n];
+            lifted.next_into(&x, &u, &mut next);
             if k > 0 {
                 states[k].retract(&x);
             }
@@ -437,9 +410,95 @@ fn bad_input_is_refused_with_its_name() {
     let mut bad = robot.start.clone();
     bad.rate[3] = f64::NAN;
     assert!(solve(0.01, &ALL, &bad, &robot.u).contains("joint rate is not finite at index 3"));
+    let other = quadruped_on(&ALL, Forces::None).stage(3);
+    let mut wrong = other.nominal();
+    let refused = stage.solve(&robot.tree, 0.01, &ALL, &robot.start, &robot.u, &mut wrong, &mut end);
+    assert!(refused.unwrap_err().to_string().contains("nodes of the nominal"));
+    let nominal = stage.nominal();
+    let refused = stage.linearize(
+        &robot.tree,
+        0.01,
+        &ALL,
+        &robot.start,
+        &nominal,
+        &robot.u,
+        &end,
+        &mut ContactStage::new(&robot.tree, &LobattoRule::new(2).unwrap(), &[]).unwrap().lifted(),
+    );
+    assert!(refused.unwrap_err().to_string().contains("of the lifted stage"));
     let double = [robot.contacts[0], robot.contacts[0]];
     let mut stage = ContactStage::new(&robot.tree, &LobattoRule::new(2).unwrap(), &double).unwrap();
     let mut nominal = stage.nominal();
     let refused = stage.solve(&robot.tree, 0.01, &[true; 2], &robot.start, &robot.u, &mut nominal, &mut end);
     assert!(matches!(refused, Err(StepError::RedundantConstraint { row: 3, .. })), "{refused:?}");
+}
+
+#[test]
+fn places_move_by_their_jacobians_and_forces_balance_by_virtual_work() {
+    let h = 1e-6;
+    for (name, robot) in robots() {
+        let (tree, nv) = (&robot.tree, robot.tree.dof());
+        let boundary = robot.boundary(&robot.start);
+        let (body, point) = (robot.contacts[0].body, Vector3::new(0.1, -0.2, 0.05));
+        let (mut of_point, mut of_turn) = (vec![0.0; 3 * nv], vec![0.0; 3 * nv]);
+        let mut of_centre = vec![0.0; 3 * nv];
+        boundary.point_jacobian_into(tree, body, &point, &mut of_point).unwrap();
+        boundary.turn_jacobian_into(tree, body, &mut of_turn).unwrap();
+        boundary.mass_centre_jacobian_into(tree, &mut of_centre).unwrap();
+        for column in 0..nv {
+            let [plus, minus] = [h, -h].map(|change| {
+                let mut x = vec![0.0; nv];
+                x[column] = change;
+                robot.boundary(&moved(&robot.start, &x))
+            });
+            let slope = |value: &dyn Fn(&BoundaryKinematics) -> Vector3<f64>| {
+                (value(&plus) - value(&minus)) / (2.0 * h)
+            };
+            let turn = log_rotation(
+                &(plus.kinematics().link_poses_w()[body].rotation
+                    * minus.kinematics().link_poses_w()[body].rotation.transpose()),
+            ) / (2.0 * h);
+            for (what, jacobian, want) in [
+                ("point", &of_point, slope(&|b| b.kinematics().point_w(body, &point))),
+                ("turn", &of_turn, turn),
+                ("mass centre", &of_centre, slope(&|b| b.mass_centre_w(tree))),
+            ] {
+                for row in 0..3 {
+                    let error = (jacobian[row * nv + column] - want[row]).abs();
+                    assert!(error < 1e-8, "{name}, {what}, column {column}: {error:e}");
+                }
+            }
+        }
+        let mut map = vec![0.0; 6 * nv];
+        boundary.centroidal_map_into(tree, &mut map).unwrap();
+        let momentum = DMatrix::from_row_slice(6, nv, &map) * DVector::from_row_slice(boundary.velocity());
+        let error = (momentum - boundary.centroidal_momentum_w(tree).to_vector()).amax();
+        assert!(error < 1e-11, "{name}: centroidal momentum {error:e}");
+
+        // u q̇ = springs - weight - contact forces for every velocity of the joints; the base keeps what is left.
+        let standing: Vec<Contact> = robot
+            .contacts
+            .iter()
+            .zip(&robot.active)
+            .filter(|(_, active)| **active)
+            .map(|(c, _)| *c)
+            .collect();
+        let (g, _) = robot.rows(&robot.start);
+        let force = sample_robots::spread(g.nrows(), 20.0);
+        let mut torque = vec![0.0; nv - 6];
+        let left = boundary.static_torques_into(tree, &standing, &force, &mut torque).unwrap().to_vector();
+        let weight = *tree.gravity_w() * tree.total_mass();
+        let pushed = g.transpose() * DVector::from_row_slice(&force);
+        for column in 0..nv {
+            let lifted: f64 = (0..3).map(|row| of_centre[row * nv + column] * weight[row]).sum();
+            let work = lifted + pushed[column];
+            let balance = if column < 6 {
+                left[column] - work
+            } else {
+                let joint = &tree.bodies()[column - 5].joint;
+                torque[column - 6] + work - joint.stiffness * (robot.start.q[column - 6] - joint.rest)
+            };
+            assert!(balance.abs() < 1e-9, "{name}, column {column}: {balance:e}");
+        }
+    }
 }

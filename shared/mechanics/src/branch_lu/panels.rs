@@ -32,6 +32,14 @@ fn fill_symmetric<const N: usize>(panels: JointPanels<'_>) {
     // J_ij[α,γ] = H_ij[α,γ], and J_ji[α,γ] = H_ij[γ,α].
     fill::<N>(rows, blocks, 0, 1);
     fill::<N>(columns, others, 1, 0);
+    for place in 0..others.len() / (N + 1) {
+        if let Some(skew) = hessian.skew_of(hessian.pair_starts[body] + place, 1, 1).first() {
+            for alpha in 1..N {
+                let at = place * N + alpha;
+                columns[at / LANES * N + alpha - 1].0[at % LANES] -= skew.0[alpha];
+            }
+        }
+    }
 }
 
 /// Row α of the panel from rows `first_row + α` of the blocks, from lane `first_lane` on.

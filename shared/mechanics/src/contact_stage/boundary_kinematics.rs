@@ -28,7 +28,9 @@ use crate::tree::{KinematicTree, NO_PARENT};
 pub struct BoundaryKinematics {
     kinematics: Kinematics,
     composites: MassMatrixWorkspace,
+    /// Not a number before the first evaluation and after a failed one.
     pose: RigidTransform,
+    q: Vec<f64>,
     velocity: Vec<f64>,
     /// On spatial base twists, then on `(V_body, q̇)`.
     mass_w: Vec<f64>,
@@ -36,6 +38,9 @@ pub struct BoundaryKinematics {
     factor: MassMatrixFactor,
     /// Articulated momenta.
     momenta_w: Vec<Wrench>,
+    /// `Ṡ_i`.
+    twist_rates_w: Vec<Twist>,
+    momentum_gradient: Vec<f64>,
 }
 
 impl BoundaryKinematics {
@@ -49,12 +54,15 @@ impl BoundaryKinematics {
         Ok(Self {
             kinematics: Kinematics::new(tree),
             composites: MassMatrixWorkspace::new(tree),
-            pose: RigidTransform::identity(),
+            pose: nowhere(),
+            q: vec![0.0; tree.joint_count()],
             velocity: vec![0.0; nv],
             mass_w: vec![0.0; nv * nv],
             mass_b: vec![0.0; nv * nv],
             factor: MassMatrixFactor::new(tree),
             momenta_w: vec![Wrench::default(); tree.body_count()],
+            twist_rates_w: vec![Twist::default(); tree.body_count()],
+            momentum_gradient: vec![0.0; nv * tree.joint_count()],
         })
     }
 
@@ -78,24 +86,28 @@ impl BoundaryKinematics {
                 return Err(StepError::NonFinite { quantity, index });
             }
         }
-        self.pose = state.base_pose_w();
+        self.pose = nowhere();
+        let pose = state.base_pose_w();
+        self.q.copy_from_slice(&state.q);
         self.velocity[..6].copy_from_slice(state.base_velocity_b.as_slice());
         self.velocity[6..].copy_from_slice(&state.rate);
-        self.kinematics.update_positions(tree, &Configuration::floating(self.pose, &state.q))?;
+        self.kinematics.update_positions(tree, &Configuration::floating(pose, &state.q))?;
         let twist = state.base_twist_w();
         self.kinematics.update_velocities(tree, &Velocity::floating(twist, &state.rate))?;
         mass_matrix_into(tree, &self.kinematics, &mut self.composites, &mut self.mass_w)?;
-        self.mass_matrix_in_base_axes();
+        self.mass_matrix_in_base_axes(&pose);
         self.factor.factorise(&self.mass_b)?;
+        self.pose = pose;
         self.update_momenta(tree);
+        self.update_momentum_gradient(tree);
         Ok(())
     }
 
     /// `diag(Ad_g, 1)ᵀ 𝓜 diag(Ad_g, 1)`.
-    fn mass_matrix_in_base_axes(&mut self) {
+    fn mass_matrix_in_base_axes(&mut self, pose: &RigidTransform) {
         let nv = self.velocity.len();
         self.mass_b.copy_from_slice(&self.mass_w);
-        let adjoint = self.pose.adjoint();
+        let adjoint = pose.adjoint();
         let base = nalgebra::Matrix6::from_fn(|r, c| self.mass_w[r * nv + c]);
         let base = adjoint.tr_mul(&(base * adjoint));
         for r in 0..6 {
@@ -105,7 +117,7 @@ impl BoundaryKinematics {
         }
         for j in 6..nv {
             let column = Vector6::from_fn(|r, _| self.mass_w[r * nv + j]);
-            let column = self.pose.inverse_transform_wrench(&Wrench::from_vector(&column)).to_vector();
+            let column = pose.inverse_transform_wrench(&Wrench::from_vector(&column)).to_vector();
             for r in 0..6 {
                 self.mass_b[r * nv + j] = column[r];
                 self.mass_b[j * nv + r] = column[r];
@@ -125,6 +137,14 @@ impl BoundaryKinematics {
                 self.momenta_w[parent] += carried;
             }
         }
+    }
+
+    /// Whether the last [`BoundaryKinematics::update`] was at this state.
+    pub fn is_at(&self, state: &BoundaryState) -> bool {
+        self.pose == state.base_pose_w()
+            && self.q == state.q
+            && self.velocity[..6] == *state.base_velocity_b.as_slice()
+            && self.velocity[6..] == state.rate
     }
 
     /// Poses and velocities of the bodies.
@@ -194,13 +214,12 @@ impl BoundaryKinematics {
     ///
     /// # Errors
     /// [`ModelError::Length`] when `out` is of another tree.
-    pub fn state_into(&self, q: &[f64], out: &mut State) -> Result<(), ModelError> {
+    pub fn state_into(&self, out: &mut State) -> Result<(), ModelError> {
         let nv = self.velocity.len();
-        check_length("joint coordinates q", q.len(), nv - 6)?;
         check_length("joint coordinates of the state", out.q.len(), nv - 6)?;
         check_length("momenta of the state", out.p.len(), nv)?;
         out.base_pose = self.pose;
-        out.q.copy_from_slice(q);
+        out.q.copy_from_slice(&self.q);
         out.p[..6].copy_from_slice(self.momenta_w[0].to_vector().as_slice());
         for joint in 0..nv - 6 {
             let body = joint + 1;
@@ -276,15 +295,10 @@ impl BoundaryKinematics {
             self.row_into(tree, contact.body, &transport, out);
             for &dof in &tree.branch(contact.body)[6..] {
                 let dof = dof as usize;
-                out[dof] += wrench.dot(&self.joint_twist_rate_w(dof - 5));
+                out[dof] += wrench.dot(&self.twist_rates_w[dof - 5]);
             }
         }
         Ok(())
-    }
-
-    /// `Ṡ_i` of a joint.
-    pub(crate) fn joint_twist_rate_w(&self, body: usize) -> Twist {
-        self.kinematics.velocities_w()[body].bracket(&self.kinematics.joint_twists_w()[body])
     }
 
     /// Velocity in {0} of a point of `body` (link frame, m) per `(V_body, q̇)`; also its displacement per `(ε, δq)`. `3 x nv`.
@@ -366,12 +380,10 @@ impl BoundaryKinematics {
     pub fn static_torques_into(
         &self,
         tree: &KinematicTree,
-        q: &[f64],
         contacts: &[Contact],
         force: &[f64],
         torques: &mut [f64],
     ) -> Result<Wrench, ModelError> {
-        check_length("joint coordinates q", q.len(), tree.joint_count())?;
         check_length("joint torques", torques.len(), tree.joint_count())?;
         check_length("contact forces", force.len(), contacts.iter().map(Contact::row_count).sum())?;
         let composite = self.composites.composite_inertias_w();
@@ -380,7 +392,7 @@ impl BoundaryKinematics {
             let (body, constants) = (joint + 1, &tree.constants()[joint + 1]);
             let inertia = &composite[body];
             let weight = Wrench::new(inertia.first_moment.cross(gravity), gravity * inertia.mass);
-            let spring = constants.stiffness * (q[joint] - constants.rest);
+            let spring = constants.stiffness * (self.q[joint] - constants.rest);
             *torque = spring - weight.dot(&self.kinematics.joint_twists_w()[body]);
         }
         let mut total = Wrench::new(composite[0].first_moment.cross(gravity), gravity * composite[0].mass);
@@ -404,31 +416,38 @@ impl BoundaryKinematics {
 
     /// Derivatives of the momenta by the joint coordinates at fixed `(V_body, q̇)`, `nv x joints` row-major: rows of `P` in base axes
     /// about its mass centre, and of `p_j`. By `ε` the momenta in base axes do not change.
-    ///
-    /// # Errors
-    /// [`ModelError::Length`] for a wrong slice.
-    pub fn momentum_gradient_into(&self, tree: &KinematicTree, out: &mut [f64]) -> Result<(), ModelError> {
-        check_length("momentum gradient", out.len(), tree.dof() * tree.joint_count())?;
+    pub fn momentum_gradient(&self) -> &[f64] {
+        &self.momentum_gradient
+    }
+
+    fn update_momentum_gradient(&mut self, tree: &KinematicTree) {
         let joints = tree.joint_count();
+        let out = &mut self.momentum_gradient;
         out.fill(0.0);
+        let twists = self.kinematics.joint_twists_w();
         let composite = self.composites.composite_inertias_w();
         for i in 1..tree.body_count() {
-            let twist = &self.kinematics.joint_twists_w()[i];
+            let twist = &twists[i];
+            self.twist_rates_w[i] = self.kinematics.velocities_w()[i].bracket(twist);
             let own = composite[i].mul_twist(twist);
             let moved =
-                composite[i].mul_twist(&self.joint_twist_rate_w(i)) - self.momenta_w[i].dual_bracket(twist);
+                composite[i].mul_twist(&self.twist_rates_w[i]) - self.momenta_w[i].dual_bracket(twist);
             let on_base = self.pose.inverse_transform_wrench(&moved).to_vector();
             for r in 0..6 {
                 out[r * joints + i - 1] = on_base[r];
             }
             for &dof in &tree.branch(i)[6..] {
                 let j = dof as usize - 5;
-                out[dof as usize * joints + i - 1] = moved.dot(&self.kinematics.joint_twists_w()[j]);
-                out[(i + 5) * joints + j - 1] = own.dot(&self.joint_twist_rate_w(j));
+                out[dof as usize * joints + i - 1] = moved.dot(&twists[j]);
+                out[(i + 5) * joints + j - 1] = own.dot(&self.twist_rates_w[j]);
             }
         }
-        Ok(())
     }
+}
+
+/// Equal to no pose.
+fn nowhere() -> RigidTransform {
+    RigidTransform::from_translation(Vector3::repeat(f64::NAN))
 }
 
 pub(crate) fn check_floating(tree: &KinematicTree) -> Result<(), ModelError> {

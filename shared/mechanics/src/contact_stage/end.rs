@@ -14,9 +14,11 @@ use alloc::vec::Vec;
 use nalgebra::{Matrix6, Vector6};
 
 use super::right_hand_sides::{joint_twist, shift_gain};
-use super::row_product::{AddDense, AddProduct, SolveRows};
-use super::{BoundaryState, ContactProjection, ContactStage, LiftedStage, StageNominal};
+use super::row_product::{AddDense, AddProduct, SolveRows, SparseRows};
+use super::{BoundaryState, ContactStage, LiftedStage, StageNominal};
+use crate::del_hessian::DelHessian;
 use crate::errors::StepError;
+use crate::lanes::LANES;
 use crate::linearize::SolveMass;
 use crate::newton_direction::{NewtonDirection, base_matrix};
 use crate::row_matrix::RowMatrix;
@@ -72,6 +74,47 @@ impl Relatives {
     }
 }
 
+impl Relative {
+    /// `H[α,γ]` with the own joint as row.
+    #[inline(always)]
+    fn entry(&self, hessian: &DelHessian, pair: usize, alpha: usize, gamma: usize) -> f64 {
+        if self.mirrored { hessian.mirrored(pair, alpha, gamma) } else { hessian.entry(pair, alpha, gamma) }
+    }
+}
+
+/// The places of the products of [`ContactStage::end_rows`] with the nodes: rows of `ε`, `δq`, `Π`, `p_j`.
+pub(super) fn end_pattern(relatives: &Relatives, nv: usize, s: usize) -> SparseRows {
+    let mut rows = SparseRows::new(2 * nv, 36 + nv + s * (12 * nv + relatives.len()));
+    for _ in 0..6 {
+        for l in 0..6 {
+            rows.push(l * s + s - 1, 0.0);
+        }
+        rows.end_row();
+    }
+    for dof in 6..nv {
+        rows.push(dof * s + s - 1, 0.0);
+        rows.end_row();
+    }
+    for _ in 0..6 {
+        for source in 0..nv * s {
+            rows.push(source, 0.0);
+        }
+        rows.end_row();
+    }
+    for joint in 0..nv - 6 {
+        for source in 0..6 * s {
+            rows.push(source, 0.0);
+        }
+        for relative in relatives.of(joint) {
+            for gamma in 0..s {
+                rows.push(relative.dof as usize * s + gamma, 0.0);
+            }
+        }
+        rows.end_row();
+    }
+    rows
+}
+
 /// What the rows of the end share.
 struct EndFrame {
     pose: RigidTransform,
@@ -89,7 +132,6 @@ impl ContactStage {
     pub(super) fn end_rows(&mut self, tree: &KinematicTree, end: &BoundaryState) -> Result<(), StepError> {
         let nv = tree.dof();
         self.ends.reshape(2 * nv, self.map_columns());
-        self.end.momentum_gradient_into(tree, &mut self.momentum_gradient)?;
         let frame = self.end_frame();
         self.fill_end_of_nodes(tree, &frame);
         let instructions = self.del.instructions;
@@ -106,8 +148,8 @@ impl ContactStage {
             target: &mut self.ends,
             first: nv,
         });
-        self.add_direct_terms(tree, &frame)?;
-        self.add_defect(tree, &frame, end)?;
+        self.add_direct_terms(tree, &frame);
+        self.add_defect(tree, &frame, end);
         instructions.dispatch_wide(SolveMass { factor: self.end.factor(), out: &mut self.ends });
         self.project_end(tree)
     }
@@ -135,22 +177,21 @@ impl ContactStage {
         }
     }
 
-    /// Products with `δΞ`.
+    /// Products with `δΞ`, in the order of [`end_pattern`].
     fn fill_end_of_nodes(&mut self, tree: &KinematicTree, frame: &EndFrame) {
-        let Self { del, solver, end_of_nodes: rows, momentum_gradient, relatives, .. } = self;
+        let Self { del, solver, end_of_nodes: rows, end, impulses, relatives, .. } = self;
+        let momentum_gradient = end.momentum_gradient();
         let Some(hessian) = solver.hessian() else { return };
         let (nv, s) = (tree.dof(), del.unknown_nodes());
         let joints = nv - 6;
-        rows.clear();
+        rows.rewind();
         for k in 0..6 {
             for l in 0..6 {
-                rows.push(l * s + s - 1, frame.twist[(k, l)]);
+                rows.refill(frame.twist[(k, l)]);
             }
-            rows.end_row();
         }
-        for dof in 6..nv {
-            rows.push(dof * s + s - 1, 1.0);
-            rows.end_row();
+        for _ in 6..nv {
+            rows.refill(1.0);
         }
         let start_twists = base_matrix(del, 0);
         let mut rigid = Matrix6::zeros();
@@ -158,49 +199,41 @@ impl ContactStage {
             rigid += Matrix6::from_fn(|r, k| hessian.rigid_column(k, alpha)[r]);
         }
         let to_base = frame.pose.adjoint().transpose();
-        let impulse = |dof: usize, gamma: usize| to_base * Vector6::from(hessian.impulse_column(dof, gamma));
+        for dof in 0..nv {
+            for gamma in 0..=s {
+                impulses[dof * (s + 1) + gamma] = to_base * Vector6::from(hessian.impulse_column(dof, gamma));
+            }
+        }
         let shifted = to_base * rigid * start_twists + frame.turn * frame.twist;
         for k in 0..6 {
-            for l in 0..6 {
+            for (dof, impulse) in impulses.chunks_exact(s + 1).enumerate() {
                 for gamma in 1..s {
-                    rows.push(l * s + gamma - 1, impulse(l, gamma)[k]);
+                    rows.refill(impulse[gamma][k]);
                 }
-                rows.push(l * s + s - 1, impulse(l, s)[k] - impulse(l, 0)[k] + shifted[(k, l)]);
+                rows.refill(if dof < 6 {
+                    impulse[s][k] - impulse[0][k] + shifted[(k, dof)]
+                } else {
+                    impulse[s][k] - momentum_gradient[k * joints + dof - 6]
+                });
             }
-            for dof in 6..nv {
-                for gamma in 1..s {
-                    rows.push(dof * s + gamma - 1, impulse(dof, gamma)[k]);
-                }
-                let moved = momentum_gradient[k * joints + dof - 6];
-                rows.push(dof * s + s - 1, impulse(dof, s)[k] - moved);
-            }
-            rows.end_row();
         }
         for joint in 0..joints {
             let first = hessian.pair_starts[joint + 1];
             let shift = start_twists.tr_mul(&Vector6::from(hessian.shift_row(joint + 6, s)));
             for l in 0..6 {
                 for gamma in 1..s {
-                    rows.push(l * s + gamma - 1, hessian.entry(first + l, s, gamma));
+                    rows.refill(hessian.entry(first + l, s, gamma));
                 }
-                let last = hessian.entry(first + l, s, s) - hessian.entry(first + l, s, 0) + shift[l];
-                rows.push(l * s + s - 1, last);
+                rows.refill(hessian.entry(first + l, s, s) - hessian.entry(first + l, s, 0) + shift[l]);
             }
+            let gradient = &momentum_gradient[(6 + joint) * joints..(7 + joint) * joints];
             for relative in relatives.of(joint) {
-                let (dof, pair) = (relative.dof as usize, relative.pair as usize);
-                for gamma in 1..=s {
-                    let mut entry = if relative.mirrored {
-                        hessian.mirrored(pair, s, gamma)
-                    } else {
-                        hessian.entry(pair, s, gamma)
-                    };
-                    if gamma == s {
-                        entry -= momentum_gradient[(6 + joint) * joints + dof - 6];
-                    }
-                    rows.push(dof * s + gamma - 1, entry);
+                let pair = relative.pair as usize;
+                for gamma in 1..s {
+                    rows.refill(relative.entry(hessian, pair, s, gamma));
                 }
+                rows.refill(relative.entry(hessian, pair, s, s) - gradient[relative.dof as usize - 6]);
             }
-            rows.end_row();
         }
     }
 
@@ -223,9 +256,9 @@ impl ContactStage {
     }
 
     /// What `x` and `u` do to the end at fixed nodes and multipliers.
-    fn add_direct_terms(&mut self, tree: &KinematicTree, frame: &EndFrame) -> Result<(), StepError> {
-        let Self { del, solver, ends, start, momentum_gradient, relatives, .. } = self;
-        let Some(hessian) = solver.hessian() else { return Ok(()) };
+    fn add_direct_terms(&mut self, tree: &KinematicTree, frame: &EndFrame) {
+        let Self { del, solver, ends, start, relatives, .. } = self;
+        let Some(hessian) = solver.hessian() else { return };
         let (nv, s) = (tree.dof(), del.unknown_nodes());
         let joints = nv - 6;
         let to_base = frame.pose.adjoint().transpose();
@@ -257,7 +290,7 @@ impl ContactStage {
                 ends.add(nv + k, 1 + nv + column, moved[k]);
             }
         }
-        start.momentum_gradient_into(tree, momentum_gradient)?;
+        let momentum_gradient = start.momentum_gradient();
         for joint in 0..joints {
             let dof = 6 + joint;
             let moved = carry * Vector6::from_fn(|r, _| momentum_gradient[r * joints + joint]);
@@ -272,23 +305,16 @@ impl ContactStage {
             }
             for relative in relatives.of(joint) {
                 let pair = relative.pair as usize;
-                let entry =
-                    if relative.mirrored { hessian.mirrored(pair, s, 0) } else { hessian.entry(pair, s, 0) };
+                let entry = relative.entry(hessian, pair, s, 0);
                 ends.add(nv + dof, 1 + relative.dof as usize, entry);
             }
             let step = del.rule.weights()[s] * del.time_step;
             ends.add(nv + dof, 1 + 2 * nv + joint, step);
         }
-        Ok(())
     }
 
     /// Distance of the end from the next boundary state.
-    fn add_defect(
-        &mut self,
-        tree: &KinematicTree,
-        frame: &EndFrame,
-        end: &BoundaryState,
-    ) -> Result<(), StepError> {
+    fn add_defect(&mut self, tree: &KinematicTree, frame: &EndFrame, end: &BoundaryState) {
         let (nv, s) = (tree.dof(), self.del.unknown_nodes());
         let joints = nv - 6;
         let turn = log_rotation(&end.orientation.tr_mul(&frame.pose.rotation));
@@ -299,7 +325,6 @@ impl ContactStage {
             self.ends.add(k, 0, turn[k]);
             self.ends.add(3 + k, 0, travel[k]);
         }
-        self.end.momentum_gradient_into(tree, &mut self.momentum_gradient)?;
         for k in 0..6 {
             self.ends.add(nv + k, 0, momentum[k]);
         }
@@ -311,13 +336,12 @@ impl ContactStage {
             let target = self.end.joint_momentum(body);
             self.ends.add(nv + 6 + joint, 0, self.change[6 + joint] - target);
             for row in 0..nv {
-                let gain = self.momentum_gradient[row * joints + joint];
+                let gain = self.end.momentum_gradient()[row * joints + joint];
                 if gain != 0.0 {
                     self.ends.add(nv + row, 0, -gain * away);
                 }
             }
         }
-        Ok(())
     }
 
     /// `δλ^s`, and the velocities after it.
@@ -336,20 +360,16 @@ impl ContactStage {
             self.end.contact_velocity_gradient_into(tree, contact, gradient)?;
             for (row, gradient) in gradient.chunks_exact(nv).enumerate() {
                 let g = &self.projection.rows()[(first + row) * nv..(first + row + 1) * nv];
-                for (column, (&of_pose, &of_rate)) in gradient.iter().zip(g).enumerate() {
-                    if of_pose != 0.0 {
-                        self.end_of_multipliers.push(column, of_pose);
-                    }
-                    if of_rate != 0.0 {
-                        self.end_of_multipliers.push(nv + column, of_rate);
-                    }
+                for &column in tree.branch(contact.body) {
+                    let column = column as usize;
+                    self.end_of_multipliers.push(column, gradient[column]);
+                    self.end_of_multipliers.push(nv + column, g[column]);
                 }
                 self.end_of_multipliers.end_row();
                 self.end_multipliers.add(first + row, 0, self.projection.velocities()[first + row]);
             }
             first += count;
         }
-        self.factor_end_responses(tree)?;
         let instructions = self.del.instructions;
         instructions.dispatch_wide(AddProduct {
             matrix: &self.end_of_multipliers,
@@ -360,7 +380,7 @@ impl ContactStage {
         instructions.dispatch_wide(SolveRows { lu: &self.projection.gram, rows: &mut self.end_multipliers });
         for column in 0..nv {
             for row in 0..m {
-                self.responses[column * m + row] = self.projection.responses[row * nv + column];
+                self.responses[column * m + row] = self.end_responses.get(nv + column, row);
             }
         }
         instructions.dispatch_wide(AddDense {
@@ -374,33 +394,50 @@ impl ContactStage {
         Ok(())
     }
 
-    /// `𝓜⁻¹G_s^T` with the contact wrenches at node s, and the factors of `W = G 𝓜⁻¹ G_s^T`: the impulse acts where the stage ends,
-    /// the velocity is that of the next boundary.
-    fn factor_end_responses(&mut self, tree: &KinematicTree) -> Result<(), StepError> {
-        let Self { del, projection, active, contacts, placements, end, regularisation, .. } = self;
-        let (nv, s, m) = (tree.dof(), del.unknown_nodes(), active.len());
+    /// Rows `G`, `y` at the next boundary, `𝓜⁻¹G_s^T` with the contact wrenches at node s, and the factors of `W = G 𝓜⁻¹ G_s^T`: the
+    /// impulse acts where the stage ends, the velocity is that of the next boundary.
+    pub(super) fn factor_end_responses(
+        &mut self,
+        tree: &KinematicTree,
+        active: &[bool],
+    ) -> Result<(), StepError> {
+        self.projection.update_rows(tree, &self.end, &self.contacts, active)?;
+        let Self { del, projection, contacts, placements, end, end_responses, .. } = self;
+        let (nv, s, m) = (tree.dof(), del.unknown_nodes(), self.active.len());
+        if m == 0 {
+            return Ok(());
+        }
         let pose = del.body_pose(0, s);
-        let ContactProjection { rows, responses, gram, mean_gram, .. } = projection;
-        for (active, response) in active.iter().zip(responses.chunks_exact_mut(nv)) {
+        end_responses.reshape(2 * nv, m);
+        for (column, active) in self.active.iter().enumerate() {
             let contact = &contacts[active.contact];
             let placement = &placements[s * contacts.len() + active.contact];
             let wrench = placement.force_row(contact, active.row);
-            response.fill(0.0);
-            response[..6].copy_from_slice(pose.inverse_transform_wrench(&wrench).to_vector().as_slice());
+            let base = pose.inverse_transform_wrench(&wrench).to_vector();
+            for k in 0..6 {
+                end_responses.set(nv + k, column, base[k]);
+            }
             for &dof in &tree.branch(contact.body)[6..] {
-                response[dof as usize] = wrench.dot(&joint_twist(del, dof as usize - 5, s));
-            }
-            end.factor().solve_in_place(response)?;
-        }
-        gram.set_order(m);
-        for (k, row) in rows.chunks_exact(nv).take(m).enumerate() {
-            for (l, response) in responses.chunks_exact(nv).take(m).enumerate() {
-                let sum: f64 = row.iter().zip(response).map(|(a, b)| a * b).sum();
-                let shift = if k == l { *regularisation * *mean_gram } else { 0.0 };
-                gram.entries_mut()[k * m + l] = sum + shift;
+                let dof = dof as usize;
+                end_responses.set(nv + dof, column, wrench.dot(&joint_twist(del, dof - 5, s)));
             }
         }
-        gram.factor().map_err(|(row, pivot)| StepError::RedundantConstraint { row, pivot })
+        del.instructions.dispatch_wide(SolveMass { factor: end.factor(), out: end_responses });
+        self.end_of_multipliers.clear();
+        for (active, row) in self.active.iter().zip(projection.rows().chunks_exact(nv)) {
+            for &dof in tree.branch(contacts[active.contact].body) {
+                self.end_of_multipliers.push(nv + dof as usize, row[dof as usize]);
+            }
+            self.end_of_multipliers.end_row();
+        }
+        self.end_multipliers.reshape(m, m);
+        del.instructions.dispatch_wide(AddProduct {
+            matrix: &self.end_of_multipliers,
+            source: end_responses,
+            target: &mut self.end_multipliers,
+            first: 0,
+        });
+        projection.factor_gram(self.regularisation, |row, column| self.end_multipliers.get(row, column))
     }
 
     /// Copies the maps.
@@ -416,7 +453,8 @@ impl ContactStage {
         }
         out.residual = self.residual.iter().fold(0.0, |largest: f64, x| largest.max(x.abs()));
         copy_rows(&self.ends, 0, 2 * nv, &mut out.transition, columns);
-        for alpha in 1..=s {
+        let maps = if out.nodes.is_empty() { 0 } else { s };
+        for alpha in 1..=maps {
             for dof in 0..nv {
                 let at = ((alpha - 1) * nv + dof) * columns;
                 copy_rows(&self.columns, dof * s + alpha - 1, 1, &mut out.nodes[at..], columns);
@@ -444,9 +482,15 @@ impl ContactStage {
 }
 
 fn copy_rows(from: &RowMatrix, first: usize, count: usize, to: &mut [f64], columns: usize) {
-    for (row, target) in to.chunks_exact_mut(columns).take(count).enumerate() {
-        for (column, value) in target.iter_mut().enumerate() {
-            *value = from.get(first + row, column);
+    let stride = from.stride();
+    let rows = from.quads()[first * stride..].chunks_exact(stride);
+    for (row, target) in rows.zip(to.chunks_exact_mut(columns)).take(count) {
+        let (fours, rest) = target.as_chunks_mut::<LANES>();
+        for (four, quad) in fours.iter_mut().zip(row) {
+            *four = quad.0;
+        }
+        if let Some(last) = row.get(fours.len()) {
+            rest.copy_from_slice(&last.0[..rest.len()]);
         }
     }
 }

@@ -3,6 +3,10 @@
 use alloc::vec;
 use alloc::vec::Vec;
 
+use super::ContactStage;
+use crate::errors::ModelError;
+use crate::kinematics::check_length;
+
 /// `x_{k+1} = A x_k + B u_k + d` of one unsolved stage with active contacts, its mean contact forces, and what its nodes and
 /// multipliers do.
 ///
@@ -40,6 +44,17 @@ impl LiftedStage {
             multipliers: vec![0.0; (s + 1) * rows * columns],
             residual: 0.0,
         }
+    }
+
+    /// # Errors
+    /// [`ModelError::Length`] when it was not made by `stage` or one like it.
+    pub(super) fn check(&self, stage: &ContactStage) -> Result<(), ModelError> {
+        let (columns, rows) = (stage.map_columns(), stage.row_count());
+        let s = stage.del.unknown_nodes();
+        check_length("columns of the lifted stage", self.columns(), columns)?;
+        check_length("contacts of the lifted stage", self.first_rows.len(), stage.contacts.len())?;
+        check_length("forces of the lifted stage", self.forces.len(), rows * columns)?;
+        check_length("multipliers of the lifted stage", self.multipliers.len(), (s + 1) * rows * columns)
     }
 
     /// Coordinates `nv = 6 + joints`; a state has `2 nv`.
@@ -82,19 +97,23 @@ impl LiftedStage {
         row_of(&self.transition, row, self.columns())
     }
 
-    /// Entry of `A`.
+    /// Entry of `A`; NaN beyond it.
     pub fn a(&self, row: usize, column: usize) -> f64 {
-        self.transition_row(row)[1 + column]
+        self.transition(row, 1 + column)
     }
 
-    /// Entry of `B`.
+    /// Entry of `B`; NaN beyond it.
     pub fn b(&self, row: usize, column: usize) -> f64 {
-        self.transition_row(row)[1 + 2 * self.nv + column]
+        self.transition(row, 1 + 2 * self.nv + column)
     }
 
     /// Entry of `d`: where the stage ends, from the next boundary state.
     pub fn d(&self, row: usize) -> f64 {
-        self.transition_row(row)[0]
+        self.transition(row, 0)
+    }
+
+    fn transition(&self, row: usize, column: usize) -> f64 {
+        self.transition_row(row).get(column).copied().unwrap_or(f64::NAN)
     }
 
     /// `[f_0 | F_x | F_u]` of active row `row`: mean force `Σ_α λ^α/Δt`, N or N·m.
@@ -102,7 +121,7 @@ impl LiftedStage {
         row_of(&self.forces, row, self.columns())
     }
 
-    /// Change of node coordinate `row` (node-major from node 1 on, base chart first).
+    /// Change of node coordinate `row` (node-major from node 1 on, base chart first); empty without the maps of the nodes.
     pub fn node_row(&self, row: usize) -> &[f64] {
         row_of(&self.nodes, row, self.columns())
     }
@@ -125,6 +144,20 @@ impl LiftedStage {
     /// [`LiftedStage::multiplier_row`] applied to deviations.
     pub fn multiplier_change(&self, alpha: usize, row: usize, x: &[f64], u: &[f64]) -> f64 {
         self.apply(self.multiplier_row(alpha, row), x, u)
+    }
+
+    /// `x_{k+1} = d + A x + B u` into `next` (`2 nv`).
+    pub fn next_into(&self, x: &[f64], u: &[f64], next: &mut [f64]) {
+        for (row, value) in next.iter_mut().enumerate() {
+            *value = self.apply(self.transition_row(row), x, u);
+        }
+    }
+
+    /// Mean forces `f_0 + F_x x + F_u u` of the active rows into `force`, N or N·m.
+    pub fn force_into(&self, x: &[f64], u: &[f64], force: &mut [f64]) {
+        for (row, value) in force.iter_mut().enumerate().take(self.rows.len()) {
+            *value = self.apply(self.force_row(row), x, u);
+        }
     }
 
     fn apply(&self, row: &[f64], x: &[f64], u: &[f64]) -> f64 {

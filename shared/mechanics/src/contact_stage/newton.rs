@@ -41,6 +41,7 @@ impl ContactStage {
     ) -> Result<StepReport, StepError> {
         check_length("joint coordinates q at the end", end.q.len(), tree.joint_count())?;
         check_length("joint rates at the end", end.rate.len(), tree.joint_count())?;
+        nominal.check(self.del.unknown_nodes(), tree.joint_count(), self.row_count())?;
         self.begin(tree, time_step, active, start, u)?;
         if self.active.is_empty() {
             return self.fly(tree, time_step, u, nominal, end);
@@ -50,9 +51,10 @@ impl ContactStage {
         self.place_nodes(tree, nominal)?;
         let report = self.newton(tree, nominal)?;
         let s = self.del.unknown_nodes();
-        if sqrt((0..3).map(|k| self.del.node(s, k) * self.del.node(s, k)).sum()) > MAX_HALF_ROTATION {
-            let change = 2.0 * MAX_HALF_ROTATION;
-            return Err(StepError::SpuriousSolution { dof: 0, change, limit: change });
+        let half = sqrt((0..3).map(|k| self.del.node(s, k) * self.del.node(s, k)).sum());
+        if half > MAX_HALF_ROTATION {
+            let limit = 2.0 * MAX_HALF_ROTATION;
+            return Err(StepError::SpuriousSolution { dof: 0, change: 2.0 * half, limit });
         }
         self.end_of_solution(tree, active, nominal, end)?;
         Ok(report)

@@ -31,8 +31,13 @@ impl ContactStage {
                 self.active.push(ActiveRow { contact: index, row, of_all: self.first_rows[index] + place });
             }
         }
-        self.start.update(tree, start)?;
-        self.start.state_into(&start.q, &mut self.state)?;
+        // The end of one stage is most often the start of the next.
+        if self.end.is_at(start) {
+            core::mem::swap(&mut self.start, &mut self.end);
+        } else if !self.start.is_at(start) {
+            self.start.update(tree, start)?;
+        }
+        self.start.state_into(&mut self.state)?;
         if self.del.time_step() != time_step {
             self.del.set_time_step(time_step)?;
         }
@@ -51,9 +56,6 @@ impl ContactStage {
         nominal: &StageNominal,
     ) -> Result<(), StepError> {
         let (s, joints) = (self.del.unknown_nodes(), tree.joint_count());
-        check_length("base nodes of the nominal", nominal.xi.len(), 6 * s)?;
-        check_length("joint nodes of the nominal", nominal.q.len(), joints * s)?;
-        check_length("multipliers of the nominal", nominal.multipliers.len(), (s + 1) * self.row_count())?;
         for alpha in 1..=s {
             for k in 0..6 {
                 self.del.set_node(alpha, k, nominal.xi[(alpha - 1) * 6 + k]);

@@ -6,6 +6,8 @@ use nalgebra::Vector3;
 
 use super::boundary_state::BoundaryState;
 use super::lifted::LiftedStage;
+use crate::errors::ModelError;
+use crate::kinematics::check_length;
 use crate::lobatto::LobattoRule;
 use crate::spatial::{exp_rotation, log_rotation};
 
@@ -82,11 +84,9 @@ impl StageNominal {
                     + slopes[1].1[k] * slope_end;
             }
             let node = &mut self.q[(alpha - 1) * self.joints..alpha * self.joints];
-            for (k, q) in node.iter_mut().enumerate() {
-                *q = start.q[k] * (1.0 - value)
-                    + end.q[k] * value
-                    + start.rate[k] * slope_start
-                    + end.rate[k] * slope_end;
+            let ends = start.q.iter().zip(&end.q).zip(start.rate.iter().zip(&end.rate));
+            for (q, ((first, last), (rate, last_rate))) in node.iter_mut().zip(ends) {
+                *q = first * (1.0 - value) + last * value + rate * slope_start + last_rate * slope_end;
             }
         }
         for (alpha, multipliers) in self.multipliers.chunks_exact_mut(self.rows.max(1)).enumerate() {
@@ -95,6 +95,15 @@ impl StageNominal {
                 *multiplier = weight * force;
             }
         }
+    }
+
+    /// # Errors
+    /// [`ModelError::Length`] for numbers that do not fit `s` unknown nodes, the joints and the rows.
+    pub(super) fn check(&self, s: usize, joints: usize, rows: usize) -> Result<(), ModelError> {
+        check_length("base nodes of the nominal", self.xi.len(), 6 * s)?;
+        check_length("joint nodes of the nominal", self.q.len(), joints * s)?;
+        check_length("multipliers of the nominal", self.multipliers.len(), (s + 1) * rows)?;
+        check_length("rows of the nominal", self.rows, rows)
     }
 
     /// Moves nodes and multipliers by what a linearisation predicts for the deviation `x` at the start and `u` of the inputs: the
@@ -114,7 +123,9 @@ impl StageNominal {
         for alpha in 0..=self.nodes {
             for (row, &all) in lifted.row_of_all().iter().enumerate() {
                 let change = lifted.multiplier_change(alpha, row, x, u);
-                self.multipliers[alpha * self.rows + all as usize] += change;
+                if let Some(multiplier) = self.multipliers.get_mut(alpha * self.rows + all as usize) {
+                    *multiplier += change;
+                }
             }
         }
     }

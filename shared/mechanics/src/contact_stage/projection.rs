@@ -20,14 +20,16 @@ pub struct ContactProjection {
     nv: usize,
     capacity: usize,
     /// Rows `G` of the active contacts on `(V_body, q̇)`, and `y = G v`.
-    pub(super) rows: Vec<f64>,
-    pub(super) velocities: Vec<f64>,
+    rows: Vec<f64>,
+    velocities: Vec<f64>,
     /// Row k holds the column k of `𝓜⁻¹Gᵀ`.
-    pub(super) responses: Vec<f64>,
+    responses: Vec<f64>,
     pub(super) gram: DenseLu,
     /// `tr(W)/m`.
     pub(super) mean_gram: f64,
     impulse: Vec<f64>,
+    /// Cholesky factor of `W`.
+    triangle: Vec<f64>,
 }
 
 impl ContactProjection {
@@ -43,6 +45,7 @@ impl ContactProjection {
             gram: DenseLu::new(rows),
             mean_gram: 0.0,
             impulse: vec![0.0; rows],
+            triangle: vec![0.0; rows * rows],
         }
     }
 
@@ -61,6 +64,61 @@ impl ContactProjection {
         &self.velocities[..self.row_count()]
     }
 
+    /// Rows and velocities of the active contacts at a boundary.
+    ///
+    /// # Errors
+    /// [`ModelError::Length`].
+    pub(super) fn update_rows(
+        &mut self,
+        tree: &KinematicTree,
+        boundary: &BoundaryKinematics,
+        contacts: &[Contact],
+        active: &[bool],
+    ) -> Result<(), ModelError> {
+        check_length("active contacts", active.len(), contacts.len())?;
+        let nv = self.nv;
+        let mut m = 0;
+        for (contact, _) in contacts.iter().zip(active).filter(|(_, active)| **active) {
+            let count = contact.row_count();
+            if m + count > self.capacity {
+                let (got, expected) = (m + count, self.capacity);
+                return Err(ModelError::Length { quantity: "contact rows", got, expected });
+            }
+            let (y, g) = (&mut self.velocities[m..m + count], &mut self.rows[m * nv..(m + count) * nv]);
+            boundary.contact_rows_into(tree, contact, y, g)?;
+            m += count;
+        }
+        self.gram.set_order(m);
+        Ok(())
+    }
+
+    /// Factors of a `W` given by its entries.
+    ///
+    /// # Errors
+    /// [`StepError::RedundantConstraint`] with the first row that depends on those before it, unless regularised.
+    pub(super) fn factor_gram(
+        &mut self,
+        regularisation: f64,
+        entry: impl Fn(usize, usize) -> f64,
+    ) -> Result<(), StepError> {
+        let m = self.gram.order();
+        self.mean_gram = 0.0;
+        let gram = self.gram.entries_mut();
+        for k in 0..m {
+            for l in 0..m {
+                gram[k * m + l] = entry(k, l);
+            }
+            self.mean_gram += gram[k * m + k] / m as f64;
+        }
+        for k in 0..m {
+            gram[k * m + k] += regularisation * self.mean_gram;
+        }
+        if regularisation == 0.0 {
+            self.refuse_dependent_rows()?;
+        }
+        self.gram.factor().map_err(|(row, pivot)| StepError::RedundantConstraint { row, pivot })
+    }
+
     /// Rows, responses and their factorised product for the active contacts at a boundary. `regularisation` ρ >= 0 allows dependent
     /// rows. O(m Σ depth + m³), no allocation.
     ///
@@ -74,74 +132,44 @@ impl ContactProjection {
         active: &[bool],
         regularisation: f64,
     ) -> Result<(), StepError> {
-        check_length("active contacts", active.len(), contacts.len())?;
-        let nv = self.nv;
-        let mut m = 0;
-        for (contact, _) in contacts.iter().zip(active).filter(|(_, active)| **active) {
-            let count = contact.row_count();
-            if m + count > self.capacity {
-                let (got, expected) = (m + count, self.capacity);
-                return Err(ModelError::Length { quantity: "contact rows", got, expected }.into());
-            }
-            let (y, g) = (&mut self.velocities[m..m + count], &mut self.rows[m * nv..(m + count) * nv]);
-            boundary.contact_rows_into(tree, contact, y, g)?;
-            m += count;
+        self.update_rows(tree, boundary, contacts, active)?;
+        let (nv, m) = (self.nv, self.row_count());
+        let mut responses = core::mem::take(&mut self.responses);
+        responses[..m * nv].copy_from_slice(&self.rows[..m * nv]);
+        let mut solved = Ok(());
+        for response in responses[..m * nv].chunks_exact_mut(nv) {
+            solved = solved.and(boundary.factor().solve_in_place(response));
         }
-        self.gram.set_order(m);
-        self.responses[..m * nv].copy_from_slice(&self.rows[..m * nv]);
-        for response in self.responses[..m * nv].chunks_exact_mut(nv) {
-            boundary.factor().solve_in_place(response)?;
-        }
-        self.mean_gram = 0.0;
-        let gram = self.gram.entries_mut();
-        for k in 0..m {
-            for l in 0..=k {
-                let (row, response) =
-                    (&self.rows[k * nv..(k + 1) * nv], &self.responses[l * nv..(l + 1) * nv]);
-                let sum: f64 = row.iter().zip(response).map(|(a, b)| a * b).sum();
-                gram[k * m + l] = sum;
-                gram[l * m + k] = sum;
-            }
-            self.mean_gram += gram[k * m + k] / m as f64;
-        }
-        for k in 0..m {
-            gram[k * m + k] += regularisation * self.mean_gram;
-        }
-        if regularisation == 0.0 {
-            self.refuse_dependent_rows()?;
-        }
-        self.gram.factor().map_err(|(row, pivot)| StepError::RedundantConstraint { row, pivot })
+        let rows = core::mem::take(&mut self.rows);
+        let outcome = self.factor_gram(regularisation, |k, l| {
+            let (k, l) = (k.max(l), k.min(l));
+            rows[k * nv..(k + 1) * nv].iter().zip(&responses[l * nv..]).map(|(a, b)| a * b).sum()
+        });
+        (self.rows, self.responses) = (rows, responses);
+        solved?;
+        outcome
     }
 
-    /// Elimination without pivoting of the positive `W`: the first pivot that vanishes belongs to the first dependent row.
+    /// Elimination without pivoting of the positive `W` (its lower triangle): the first pivot that vanishes belongs to the first
+    /// dependent row.
     fn refuse_dependent_rows(&mut self) -> Result<(), StepError> {
         let m = self.gram.order();
-
-        // The Cholesky factor is built in the upper triangle.
+        let Self { gram, triangle, .. } = self;
         for k in 0..m {
-            let scale = self.gram.entry(k, k);
-            let mut pivot = scale;
-            for c in 0..k {
-                let l = self.gram.entry(c, k);
-                pivot -= l * l;
-            }
-            if pivot <= super::DEPENDENT_ROW * scale || pivot.is_nan() {
-                return Err(StepError::RedundantConstraint { row: k, pivot: pivot / scale });
-            }
-            let root = crate::real::sqrt(pivot);
-            for r in k + 1..m {
-                let mut value = self.gram.entry(r, k);
-                for c in 0..k {
-                    value -= self.gram.entry(c, r) * self.gram.entry(c, k);
+            for c in 0..=k {
+                let mut value = gram.entry(k, c);
+                for j in 0..c {
+                    value -= triangle[k * m + j] * triangle[c * m + j];
                 }
-                self.gram.entries_mut()[k * m + r] = value / root;
-            }
-        }
-        // The Cholesky factor stands in the upper triangle: put the matrix back.
-        for k in 0..m {
-            for r in k + 1..m {
-                let value = self.gram.entry(r, k);
-                self.gram.entries_mut()[k * m + r] = value;
+                if c < k {
+                    triangle[k * m + c] = value / triangle[c * m + c];
+                    continue;
+                }
+                let scale = gram.entry(k, k);
+                if value <= super::DEPENDENT_ROW * scale || value.is_nan() {
+                    return Err(StepError::RedundantConstraint { row: k, pivot: value / scale });
+                }
+                triangle[k * m + k] = crate::real::sqrt(value);
             }
         }
         Ok(())

@@ -14,7 +14,6 @@ use nalgebra::{Matrix6, Vector6};
 
 use super::ContactStage;
 use crate::del_residual::DelWorkspace;
-use crate::errors::ModelError;
 use crate::lanes::LANES;
 use crate::newton_direction::{NewtonDirection, base_matrix};
 use crate::spatial::{Twist, Wrench};
@@ -22,7 +21,7 @@ use crate::tree::KinematicTree;
 
 impl ContactStage {
     /// `-[r | R_x | R_u]`, then `𝒜`.
-    pub(super) fn fill_columns(&mut self, tree: &KinematicTree) -> Result<(), ModelError> {
+    pub(super) fn fill_columns(&mut self, tree: &KinematicTree) {
         let (nv, s) = (tree.dof(), self.del.unknown_nodes());
         let first = self.map_columns();
         self.columns.reshape(s * nv, first + s * self.active.len());
@@ -31,7 +30,7 @@ impl ContactStage {
         }
         self.fill_pose_columns(tree);
         self.fill_joint_columns(tree);
-        self.fill_momentum_columns(tree)?;
+        self.fill_momentum_columns(tree);
         for joint in 0..nv - 6 {
             for alpha in 0..s {
                 let step = self.del.rule.weights()[alpha] * self.del.time_step;
@@ -39,7 +38,6 @@ impl ContactStage {
             }
         }
         self.fill_force_columns(tree, first);
-        Ok(())
     }
 
     /// Only `-r` and `𝒜`: a Newton iteration.
@@ -101,40 +99,39 @@ impl ContactStage {
     }
 
     /// The momenta at the start: by `q` at fixed velocity, and by the velocity.
-    fn fill_momentum_columns(&mut self, tree: &KinematicTree) -> Result<(), ModelError> {
-        let Self { del, columns, start, momentum_gradient, .. } = self;
+    fn fill_momentum_columns(&mut self, tree: &KinematicTree) {
+        let Self { del, columns, start, .. } = self;
         let (nv, s) = (tree.dof(), del.unknown_nodes());
-        start.momentum_gradient_into(tree, momentum_gradient)?;
         let on_base = base_momentum_rows(del);
         let joints = nv - 6;
-        let mass = start.mass_matrix();
+        let (mass, gradient) = (start.mass_matrix(), start.momentum_gradient());
         for column in 0..nv {
-            let of_rate = Vector6::from_fn(|r, _| mass[r * nv + column]);
-            let rows = on_base * of_rate;
+            let rows = on_base * Vector6::from_fn(|r, _| mass[r * nv + column]);
             for k in 0..6 {
                 columns.add(k * s, 1 + nv + column, -rows[k]);
             }
-            for dof in 6..nv {
-                let value = mass[dof * nv + column];
-                if value != 0.0 {
-                    columns.add(dof * s, 1 + nv + column, -value);
-                }
-            }
         }
         for joint in 0..joints {
-            let moved = Vector6::from_fn(|r, _| momentum_gradient[r * joints + joint]);
-            let rows = on_base * moved;
+            let rows = on_base * Vector6::from_fn(|r, _| gradient[r * joints + joint]);
             for k in 0..6 {
                 columns.add(k * s, 7 + joint, -rows[k]);
             }
-            for dof in 6..nv {
-                let value = momentum_gradient[dof * joints + joint];
-                if value != 0.0 {
-                    columns.add(dof * s, 7 + joint, -value);
+        }
+        for i in 1..tree.body_count() {
+            let dof = tree.joint_dof(i);
+            for &j in tree.branch(i) {
+                let j = j as usize;
+                let value = -mass[dof * nv + j];
+                columns.set(dof * s, 1 + nv + j, value);
+                if j >= 6 {
+                    columns.set(j * s, 1 + nv + dof, value);
+                    columns.add(dof * s, 1 + j, -gradient[dof * joints + j - 6]);
+                    if j != dof {
+                        columns.add(j * s, 1 + dof, -gradient[j * joints + dof - 6]);
+                    }
                 }
             }
         }
-        Ok(())
     }
 
     fn fill_force_columns(&mut self, tree: &KinematicTree, first: usize) {

@@ -31,11 +31,9 @@ impl ContactStage {
         });
         self.schur.set_order(size);
         let scale = self.regularisation * self.projection.mean_gram * self.del.time_step;
-        for r in 0..size {
-            for c in 0..size {
-                let entry = self.multipliers.get(r, first + c);
-                self.schur.entries_mut()[r * size + c] = if r == c { entry - scale } else { entry };
-            }
+        for (r, row) in self.schur.entries_mut().chunks_exact_mut(size).enumerate() {
+            self.multipliers.copy_part(r, first, row);
+            row[r] -= scale;
         }
         self.schur
             .factor()
@@ -43,10 +41,8 @@ impl ContactStage {
         self.add_defects(tree, lifted);
         instructions.dispatch_wide(SolveRows { lu: &self.schur, rows: &mut self.multipliers });
         let rows = self.columns.rows();
-        for r in 0..rows {
-            for c in 0..size {
-                self.responses[r * size + c] = self.columns.get(r, first + c);
-            }
+        for (r, response) in self.responses.chunks_exact_mut(size).take(rows).enumerate() {
+            self.columns.copy_part(r, first, response);
         }
         instructions.dispatch_wide(AddDense {
             block: &self.responses[..rows * size],

@@ -162,7 +162,7 @@ pub(super) fn composites<S: Simd>(
             }
         }
     }
-    if !del.loads.is_empty() {
+    if del.has_dead_loads() {
         own_dead_loads(simd, del, hessian, groups);
     }
     for (at, gain) in del.gains.iter().enumerate() {
@@ -178,7 +178,7 @@ pub(super) fn composites<S: Simd>(
             let (parents, own) = hessian.composites.split_at_mut(at);
             accumulate(simd, &mut parents[to].first_moment, &own[0].first_moment);
             accumulate(simd, &mut parents[to].rotational, &own[0].rotational);
-            if !del.loads.is_empty() {
+            if del.has_dead_loads() {
                 let own = hessian.dead[at];
                 accumulate(simd, &mut hessian.dead[to].arm_cross, &own.arm_cross);
                 accumulate(simd, &mut hessian.dead[to].force, &own.force);
@@ -219,6 +219,16 @@ pub(super) fn own_dead_loads<S: Simd>(simd: S, del: &DelWorkspace, hessian: &mut
             }
         }
     }
+    for held in del.dead_torques() {
+        for g in 0..groups {
+            // τ^
+            let arm_cross = &mut hessian.dead[held.body * groups + g].arm_cross;
+            let [x, y, z] = load(simd, &held.torque_w[g]);
+            for (at, value) in [(1, -z), (2, y), (3, z), (5, -x), (6, -y), (7, x)] {
+                arm_cross[at] = (Lane::load(simd, &arm_cross[at]) + value).quad();
+            }
+        }
+    }
 }
 
 /// `c` of a twist: `∂(Xᵀ F)/∂q_j = s_jᵀ c` for the subtree's forces of fixed direction.
@@ -236,7 +246,7 @@ pub(super) fn fixed_direction_row<S: Simd>(
     let mass = tree.constants()[i].subtree_mass;
     let h = load(simd, &hessian.composites[at].first_moment);
     let mut c = gravity_column(simd, &gravity, mass, h, twist);
-    if !del.loads.is_empty() {
+    if del.has_dead_loads() {
         let (s, n) = halves(twist);
         let dead = &hessian.dead[at];
         let loaded = sub(mat_tr_vec(&load(simd, &dead.arm_cross), s), cross(load(simd, &dead.force), n));
@@ -261,7 +271,7 @@ pub(super) fn fixed_direction_gain<S: Simd>(
     let h = load(simd, &hessian.composites[at].first_moment);
     let mass = Lane::splat(simd, tree.constants()[i].subtree_mass);
     let mut gain = join(cross(h, turned), scale(mass, turned));
-    if !del.loads.is_empty() {
+    if del.has_dead_loads() {
         let dead = &hessian.dead[at];
         let s = halves(x).0;
         let upper = crate::lanes::mat_vec(&load(simd, &dead.arm_cross), s);

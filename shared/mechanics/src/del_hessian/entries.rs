@@ -14,6 +14,12 @@ pub(super) fn lane(quads: &[Quad; 6], node: usize) -> [f64; 6] {
     out
 }
 
+/// The asymmetric part at equal nodes.
+#[inline(always)]
+pub(super) fn skew(lanes: &[Quad], alpha: usize, gamma: usize) -> f64 {
+    if alpha == gamma && !lanes.is_empty() { lanes[alpha / LANES].0[alpha % LANES] } else { 0.0 }
+}
+
 /// `H` of one pair of coordinates.
 #[derive(Clone, Copy)]
 pub(crate) struct PairBlock<'a> {
@@ -21,6 +27,8 @@ pub(crate) struct PairBlock<'a> {
     pub(super) mirror: &'a [Quad],
     pub(super) symmetric: bool,
     pub(super) groups: usize,
+    /// What the mirror image has less at equal nodes (lanes); empty without held torques.
+    pub(super) skew: &'a [Quad],
 }
 
 impl PairBlock<'_> {
@@ -34,7 +42,7 @@ impl PairBlock<'_> {
     #[inline(always)]
     pub fn mirrored(&self, alpha: usize, gamma: usize) -> f64 {
         if self.symmetric {
-            return self.entry(gamma, alpha);
+            return self.entry(gamma, alpha) - skew(self.skew, alpha, gamma);
         }
         self.mirror[alpha * self.groups + gamma / LANES].0[gamma % LANES]
     }
@@ -49,6 +57,8 @@ pub(crate) struct JointAndBase<'a> {
     pub(super) impulses: &'a [[Quad; 6]],
     pub(super) s: usize,
     pub(super) groups: usize,
+    /// As in [`PairBlock`], six pairs.
+    pub(super) skew: &'a [Quad],
 }
 
 impl JointAndBase<'_> {
@@ -80,7 +90,9 @@ impl JointAndBase<'_> {
     #[inline(always)]
     pub(super) fn mirrored(&self, k: usize, alpha: usize, gamma: usize) -> f64 {
         if self.mirror.is_empty() {
-            return self.plain(k, gamma, alpha);
+            let own =
+                if self.skew.is_empty() { &[] } else { &self.skew[k * self.groups..(k + 1) * self.groups] };
+            return self.plain(k, gamma, alpha) - skew(own, alpha, gamma);
         }
         self.mirror[(k * (self.s + 1) + alpha) * self.groups + gamma / LANES].0[gamma % LANES]
     }

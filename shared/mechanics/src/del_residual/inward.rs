@@ -85,6 +85,18 @@ pub(super) fn own_impulses<S: Simd>(simd: S, tree: &KinematicTree, workspace: &m
             body.impulse = store(crate::lanes::scale_add(step, wrench, load(simd, &body.impulse)));
         }
     }
+    if workspace.gains.is_empty() {
+        for held in &workspace.held_torques {
+            for g in 0..groups {
+                let step = Lane::load(simd, &workspace.weights[g]);
+                let impulse = &mut workspace.bodies[held.body * groups + g].impulse;
+                for k in 0..3 {
+                    let torque = Lane::load(simd, &held.torque_w[g][k]);
+                    impulse[k] = step.mul_add(torque, Lane::load(simd, &impulse[k])).quad();
+                }
+            }
+        }
+    }
 }
 
 /// Force of a dead load and the arm it acts on: from the origin of {0} to the point, or the couple's own arm.

@@ -170,30 +170,55 @@ pub(crate) struct SolveMass<'a> {
 impl Kernel for SolveMass<'_> {
     type Output = ();
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
-        let Self { factor, out } = self;
-        let stride = out.stride() / WIDE;
-        let n = factor.pivots().len();
-        let out = out.pieces_mut();
-        for at in 0..stride {
-            let row = |k: usize| (n + k) * stride + at;
-            for k in (0..n).rev() {
-                let own = WideLane::of(simd, &out[row(k)]);
-                for &j in factor.ancestors(k) {
-                    let l = WideLane::splat(simd, factor.lower(k, j as usize));
-                    let target = &mut out[row(j as usize)];
-                    *target = l.neg_mul_add(own, WideLane::of(simd, target)).quads();
-                }
+    fn run<S: Simd>(mut self, simd: S) {
+        let stride = self.out.stride() / WIDE;
+        let mut at = 0;
+        while S::WIDES == 2 && at + 2 <= stride {
+            solve_mass_at::<S, 2>(simd, &mut self, at);
+            at += 2;
+        }
+        for at in at..stride {
+            solve_mass_at::<S, 1>(simd, &mut self, at);
+        }
+    }
+}
+
+/// `W` pieces of the columns from `at` on.
+#[inline(always)]
+fn solve_mass_at<S: Simd, const W: usize>(simd: S, work: &mut SolveMass<'_>, at: usize) {
+    let factor = work.factor;
+    let stride = work.out.stride() / WIDE;
+    let n = factor.pivots().len();
+    let out = work.out.pieces_mut();
+    let zero = WideLane::splat(simd, 0.0);
+    for k in (0..n).rev() {
+        let mut own = [zero; W];
+        for w in 0..W {
+            own[w] = WideLane::of(simd, &out[(n + k) * stride + at + w]);
+        }
+        for &j in factor.ancestors(k) {
+            let l = WideLane::splat(simd, factor.lower(k, j as usize));
+            let target = &mut out[(n + j as usize) * stride + at..][..W];
+            for w in 0..W {
+                target[w] = l.neg_mul_add(own[w], WideLane::of(simd, &target[w])).quads();
             }
-            for k in 0..n {
-                let scale = WideLane::splat(simd, 1.0 / factor.pivots()[k]);
-                let mut own = scale.mul_add(WideLane::of(simd, &out[row(k)]), WideLane::splat(simd, 0.0));
-                for &j in factor.ancestors(k) {
-                    let l = WideLane::splat(simd, factor.lower(k, j as usize));
-                    own = l.neg_mul_add(WideLane::of(simd, &out[row(j as usize)]), own);
-                }
-                out[row(k)] = own.quads();
+        }
+    }
+    for k in 0..n {
+        let scale = WideLane::splat(simd, 1.0 / factor.pivots()[k]);
+        let mut own = [zero; W];
+        for w in 0..W {
+            own[w] = scale.mul_add(WideLane::of(simd, &out[(n + k) * stride + at + w]), zero);
+        }
+        for &j in factor.ancestors(k) {
+            let l = WideLane::splat(simd, factor.lower(k, j as usize));
+            let source = &out[(n + j as usize) * stride + at..][..W];
+            for w in 0..W {
+                own[w] = l.neg_mul_add(WideLane::of(simd, &source[w]), own[w]);
             }
+        }
+        for w in 0..W {
+            out[(n + k) * stride + at + w] = own[w].quads();
         }
     }
 }

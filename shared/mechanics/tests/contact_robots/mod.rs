@@ -11,9 +11,10 @@ use delmpc_mechanics::spatial::exp_rotation;
 use nalgebra::DMatrix;
 
 use crate::oracle;
-use crate::sample_robots::{Forces, GRAVITY, quadruped, spread};
+use crate::sample_robots::{Forces, GRAVITY, arms, quadruped, spread};
 
 /// A robot, its contacts, and a start that moves on the active ones.
+#[derive(Clone)]
 pub struct Robot {
     pub tree: KinematicTree,
     pub contacts: Vec<Contact>,
@@ -40,6 +41,20 @@ pub fn quadruped_on(active: &[bool], forces: Forces) -> Robot {
     let mut robot = Robot { tree, contacts, active: active.to_vec(), start, u };
     robot.start = robot.projected(&robot.start);
     robot
+}
+
+/// Two arms on a base with springs, dampers, body drag and body wrenches; the end of one arm stands as a flat foot on a slope.
+pub fn arms_on_a_foot() -> Robot {
+    let tree = arms(GRAVITY, Forces::All);
+    let sole = exp_rotation(&Vector3::new(0.2, -0.1, 0.3));
+    let slope = exp_rotation(&Vector3::new(0.1, 0.2, -0.3));
+    let contacts = vec![Contact::foot(3, Vector3::new(0.02, 0.03, -0.2), sole).on(slope)];
+    let mut start = BoundaryState::zeros(&tree);
+    start.orientation = exp_rotation(&Vector3::new(0.2, -0.1, 0.4));
+    start.q = spread(4, 0.4);
+    start.base_velocity_b = Vector6::new(0.3, -0.2, 0.4, 0.3, 0.1, -0.2);
+    start.rate = spread(4, 0.5);
+    Robot { tree, contacts, active: vec![true], start, u: spread(4, 1.0) }
 }
 
 /// Atlas on its pelvis (36 coordinates), a flat foot on each leg, and the same robot rooted at its right foot.
@@ -145,7 +160,7 @@ impl Robot {
             .collect();
         let mut u = vec![0.0; self.tree.joint_count()];
         let boundary = self.boundary(&self.start);
-        boundary.static_torques_into(&self.tree, &self.start.q, &standing, &force, &mut u).unwrap();
+        boundary.static_torques_into(&self.tree, &standing, &force, &mut u).unwrap();
         u
     }
 
@@ -200,6 +215,32 @@ impl Robot {
         let point = |c: &Contact| boundary.placement(&self.tree, c).point_w;
         self.contacts.iter().flat_map(|c| point(c).iter().copied().collect::<Vec<f64>>()).collect()
     }
+}
+
+/// `(ε, δq, δV, δq̇) -> (ε, δq, δπ, δp_j)`.
+pub fn canonical(tree: &KinematicTree, state: &BoundaryState) -> DMatrix<f64> {
+    let (nv, joints) = (tree.dof(), tree.joint_count());
+    let mut boundary = BoundaryKinematics::new(tree).unwrap();
+    boundary.update(tree, state).unwrap();
+    let mut map = DMatrix::identity(2 * nv, 2 * nv);
+    let gradient = boundary.momentum_gradient();
+    let momentum = boundary.base_pose_w().inverse_transform_wrench(&boundary.momentum_w());
+    for r in 0..nv {
+        for c in 0..nv {
+            map[(nv + r, nv + c)] = boundary.mass_matrix()[r * nv + c];
+        }
+        for j in 0..joints {
+            map[(nv + r, 6 + j)] = gradient[r * joints + j];
+        }
+    }
+    for k in 0..6 {
+        let unit = Twist::from_vector(&Vector6::ith(k, 1.0));
+        let half = momentum.dual_bracket(&unit).to_vector() * -0.5;
+        for r in 0..6 {
+            map[(nv + r, k)] = half[r];
+        }
+    }
+    map
 }
 
 pub fn a(lifted: &LiftedStage) -> DMatrix<f64> {
