@@ -122,6 +122,7 @@ pub fn config(setup: &Setup, model: &LeggedModel) -> Result<LeggedConfig, String
             lift_m: or(legged.swing_lift_m, LIFT_PART),
             depth_m: or(legged.swing_depth_m, DEPTH_PART),
         },
+        crouch_m: legged.crouch_m,
         motion: motion(setup, model)?,
         qp: core_config.qp,
         fallback: core_config.fallback,

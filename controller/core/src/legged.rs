@@ -19,6 +19,7 @@ use delmpc_estimation::prelude::{EstimatorConfig, EstimatorModel};
 use delmpc_horizon::base_path::BasePath;
 use delmpc_horizon::contact_schedule::{ContactSchedule, Foothold};
 use delmpc_horizon::gait::{Gait, GaitWalk};
+use delmpc_horizon::ground_height::GroundHeight;
 use delmpc_horizon::legged_model::LeggedModel;
 use delmpc_horizon::legged_problem::{LeggedLimits, LeggedProblem};
 use delmpc_horizon::legged_tasks::LeggedWeights;
@@ -121,6 +122,8 @@ pub struct LeggedConfig {
     pub limits: LeggedLimits,
     /// How a foot swings.
     pub swing: SwingShape,
+    /// By how much the robot crouches before it steps, m.
+    pub crouch_m: f64,
     /// What to do.
     pub motion: Motion,
     /// The constrained QP.
@@ -148,6 +151,9 @@ pub struct LeggedController {
     grid: StageGrid,
     reference: MotionReference,
     walk: Option<GaitWalk>,
+    ground: GroundHeight,
+    /// Height of the mass centre above the planned ground, m.
+    height_m: f64,
     /// Whether schedule and reference are those of a measured robot.
     placed: bool,
     problem: LeggedProblem,
@@ -192,6 +198,7 @@ impl LeggedController {
         let problem = LeggedProblem::new(model, grid.stages(), config.weights.clone(), &config.limits)?;
         let places = sensing::home_places(model)?;
         let reference = MotionReference::new(model, grid.stages(), config.swing, &places)?;
+        let schedule = ContactSchedule::standing(&places, STANCES);
         let size = problem.problem.size();
         let plan = MotionPlan::new(&model.tree, grid.stages(), problem.contact_rows());
         let mut command = Command::new(0, robot.joint_set_hash, joints as u32);
@@ -201,7 +208,9 @@ impl LeggedController {
         Ok(Self {
             sensing: LeggedSensing::new(&robot)?,
             ladder: FallbackLadder::new(config.fallback),
-            schedule: ContactSchedule::standing(&places, STANCES),
+            ground: GroundHeight::new(&schedule),
+            height_m: reference.aim().height_m,
+            schedule,
             walk: None,
             placed: false,
             riccati: Riccati::new(size),
@@ -348,21 +357,27 @@ impl LeggedController {
                 if !lay_out(steps, &mut self.schedule) {
                     return Err(ControlError::Model { reason: "the steps do not fit one after the other" });
                 }
+                let first_s = steps.first().map_or(0.0, |step| step.lift_s);
+                (aim.crouch_m, aim.crouched_s) = (self.config.crouch_m, first_s);
                 let ground = places.iter().map(|place| place.position_w.z).sum::<f64>() / places.len() as f64;
                 let (height, gravity) = (aim.height_m - ground, model.tree.gravity_w().norm());
                 aim.mass_centre = Some(mass_centre_over(steps, &places, aim.path.origin, height, gravity));
             }
         }
+        self.ground = GroundHeight::new(&self.schedule);
+        self.height_m = self.reference.aim().height_m;
         self.placed = true;
         Ok(())
     }
 
     /// Switches, grid, aims and nominal of a horizon that begins at `start_s`.
     fn look_ahead(&mut self, measured_s: f64, start_s: f64) -> Result<(), u32> {
-        let Self { schedule, grid, reference, walk, sensing, robot, .. } = self;
+        let Self { schedule, grid, reference, walk, sensing, robot, ground, .. } = self;
         let model = &robot.model;
         self.retimed =
             retime(schedule, sensing.feet(), measured_s, start_s - measured_s + self.config.period_s);
+        ground.update(schedule, sensing.feet(), measured_s, self.config.period_s);
+        reference.aim_mut().height_m = self.height_m + ground.offset_m();
         schedule.forget_before(measured_s - 1.0);
         if let Some(walk) = walk {
             let horizon_s: f64 = self.config.stage_lengths.iter().sum();

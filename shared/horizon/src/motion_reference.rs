@@ -33,6 +33,9 @@ const ROUNDS: usize = 2;
 /// A moment, s: longer than what makes two times one.
 const BEFORE_S: f64 = 4e-6;
 
+/// How long it takes to crouch, s.
+const CROUCH_S: f64 = 0.6;
+
 /// Where base and mass centre go.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Aim {
@@ -42,6 +45,10 @@ pub struct Aim {
     pub mass_centre: Option<MassCentrePlan>,
     /// Height of the mass centre, m.
     pub height_m: f64,
+    /// It goes down by this before the first step, so that no leg has to stretch, m ...
+    pub crouch_m: f64,
+    /// ... until then, s.
+    pub crouched_s: f64,
 }
 
 impl Aim {
@@ -54,7 +61,15 @@ impl Aim {
                 [point.position, point.velocity, point.acceleration]
             }
         };
-        [with_height(&place, self.height_m), with_height(&velocity, 0.0), with_height(&acceleration, 0.0)]
+        let part = 1.0 + ((time_s - self.crouched_s) / CROUCH_S).clamp(-1.0, 0.0);
+        let down = part * part * part * (10.0 + part * (6.0 * part - 15.0));
+        let speed = 30.0 * part * part * (1.0 - part) * (1.0 - part) / CROUCH_S;
+        let change = 60.0 * part * (1.0 - part) * (1.0 - 2.0 * part) / (CROUCH_S * CROUCH_S);
+        [
+            with_height(&place, self.height_m - self.crouch_m * down),
+            with_height(&velocity, -self.crouch_m * speed),
+            with_height(&acceleration, -self.crouch_m * change),
+        ]
     }
 }
 
@@ -130,6 +145,8 @@ impl MotionReference {
             path: BasePath::still(middle.xy() + offset, yaw + turned),
             mass_centre: None,
             height_m: middle.z + mass_centre.z - middle_home.z,
+            crouch_m: 0.0,
+            crouched_s: 0.0,
         };
         let target = Target {
             state: home.clone(),
@@ -261,13 +278,7 @@ impl MotionReference {
         let wrench = Vector6::new(0.0, 0.0, 0.0, carried.x, carried.y, carried.z);
         share_load(shares, rows, &target.mass_centre_w, &wrench, &mut target.force);
         kinematics.update(&model.tree, &target.state)?;
-        kinematics.static_torques_into(
-            &model.tree,
-            &target.state.q,
-            contacts,
-            &target.force,
-            &mut target.torque,
-        )?;
+        kinematics.static_torques_into(&model.tree, contacts, &target.force, &mut target.torque)?;
         for (torque, limit) in target.torque.iter_mut().zip(&model.limits) {
             *torque = torque.clamp(-limit.effort, limit.effort);
         }

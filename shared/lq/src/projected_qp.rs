@@ -173,6 +173,8 @@ impl ProjectedQp {
 
     /// What can be done before `x_0` is known: brings the rows that were active at the last solution in.
     pub fn prepare(&mut self, problem: &LqProblem, riccati: &Riccati) {
+        // A stage may have lost rows since: a foot that lifts off.
+        self.active.retain(|(row, _)| problem.bound(*row) < f64::INFINITY);
         self.active.sort_unstable_by_key(|(row, _)| core::cmp::Reverse(*row));
         self.rows.clear();
         self.rows.extend(self.active.iter().map(|(row, _)| *row));

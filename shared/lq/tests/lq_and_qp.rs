@@ -342,3 +342,30 @@ fn hostile(seeds: std::ops::Range<u64>) -> u32 {
     println!("solved {solved}, refused {refused}");
     solved
 }
+
+#[test]
+fn a_row_that_a_stage_has_lost_is_not_started_from() {
+    let limits = Limits { input: 50.0, row: 0.3, state: 100.0, penalty: 1e3 };
+    let mut problem = problem(5, SIZE, limits);
+    let x0 = start(5, SIZE.states, 1.0);
+    let mut riccati = Riccati::new(SIZE);
+    riccati.factorise(&problem).unwrap();
+    let mut backend = ActiveSetDual::new(64);
+    let mut qp = ProjectedQp::new(SIZE, ProjectedQpOptions::default());
+    let mut t = Trajectory::new(SIZE);
+    t.x_mut(0).copy_from_slice(&x0);
+    let first = qp.solve(&problem, &riccati, &mut backend, &mut t).unwrap();
+    let of_outputs = 2 * (SIZE.inputs + SIZE.states);
+    assert!(qp.multipliers().any(|(row, y)| usize::from(row.index) >= of_outputs && y > 0.0), "{first:?}");
+    for stage in &mut problem.stages {
+        stage.row_bounds.fill(f64::INFINITY);
+    }
+    qp.prepare(&problem, &riccati);
+    let warm = qp.solve(&problem, &riccati, &mut backend, &mut t).unwrap();
+    let (cold, report) = solve(&problem, &x0, &mut ActiveSetDual::new(64), ProjectedQpOptions::default());
+    assert_eq!((warm.dropped_rows, warm.backend_failures), (0, 0));
+    assert_eq!((warm.worst, report.worst), (None, None));
+    for k in 0..SIZE.stages {
+        assert!(t.u(k).iter().zip(cold.u(k)).all(|(a, b)| (a - b).abs() < 1e-8));
+    }
+}

@@ -175,6 +175,8 @@ pub struct LeggedSettings {
     pub swing_lift_m: f64,
     /// How far below the ground a swing ends, m; 0: by the robot's size.
     pub swing_depth_m: f64,
+    /// How far the mass centre goes down before the first step, m.
+    pub crouch_m: f64,
     /// Least normal force of a foot that stands, as a part of the weight.
     pub min_force_fraction: f64,
     /// Time over which the servo takes the mean of velocities, s.
@@ -200,6 +202,7 @@ impl Default for LeggedSettings {
             terminal_s: 0.15,
             swing_lift_m: 0.0,
             swing_depth_m: 0.0,
+            crouch_m: 0.0,
             min_force_fraction: 0.005,
             rate_mean_s: 0.002,
         }
@@ -249,6 +252,7 @@ impl LeggedSettings {
             ("controller.legged.terminal_s", self.terminal_s, 0.0, 100.0),
             ("controller.legged.swing_lift_m", self.swing_lift_m, 0.0, 1.0),
             ("controller.legged.swing_depth_m", self.swing_depth_m, 0.0, 0.1),
+            ("controller.legged.crouch_m", self.crouch_m, -1.0, 1.0),
             ("controller.legged.min_force_fraction", self.min_force_fraction, 0.0, 1.0),
             ("controller.legged.rate_mean_s", self.rate_mean_s, 0.0, 0.02),
         ]);
