@@ -19,8 +19,8 @@ use delmpc_estimation::prelude::{EstimatorConfig, EstimatorModel};
 use delmpc_horizon::base_path::BasePath;
 use delmpc_horizon::contact_schedule::{ContactSchedule, Foothold};
 use delmpc_horizon::gait::{Gait, GaitWalk};
-use delmpc_horizon::ground_height::GroundHeight;
-use delmpc_horizon::legged_model::LeggedModel;
+use delmpc_horizon::ground_plane::GroundPlane;
+use delmpc_horizon::legged_model::{FootShape, LeggedModel};
 use delmpc_horizon::legged_problem::{LeggedLimits, LeggedProblem};
 use delmpc_horizon::legged_tasks::LeggedWeights;
 use delmpc_horizon::motion_plan::MotionPlan;
@@ -151,7 +151,9 @@ pub struct LeggedController {
     grid: StageGrid,
     reference: MotionReference,
     walk: Option<GaitWalk>,
-    ground: GroundHeight,
+    ground: GroundPlane,
+    /// Whether a foot is flat.
+    flat: Vec<bool>,
     /// Height of the mass centre above the planned ground, m.
     height_m: f64,
     /// Whether schedule and reference are those of a measured robot.
@@ -199,6 +201,7 @@ impl LeggedController {
         let places = sensing::home_places(model)?;
         let reference = MotionReference::new(model, grid.stages(), config.swing, &places)?;
         let schedule = ContactSchedule::standing(&places, STANCES);
+        let flat: Vec<bool> = model.feet.iter().map(FootShape::is_flat).collect();
         let size = problem.problem.size();
         let plan = MotionPlan::new(&model.tree, grid.stages(), problem.contact_rows());
         let mut command = Command::new(0, robot.joint_set_hash, joints as u32);
@@ -208,7 +211,8 @@ impl LeggedController {
         Ok(Self {
             sensing: LeggedSensing::new(&robot)?,
             ladder: FallbackLadder::new(config.fallback),
-            ground: GroundHeight::new(&schedule),
+            ground: GroundPlane::new(&places, &flat),
+            flat,
             height_m: reference.aim().height_m,
             schedule,
             walk: None,
@@ -266,6 +270,39 @@ impl LeggedController {
             near_posture: false,
             blind_s: self.last_state_ns.map_or(0.0, |last| now_s - self.run_time_s(last)),
         });
+        #[cfg(feature = "std")]
+        if std::env::var_os("LEGDBG").is_some() {
+            extern crate std;
+            let sch: u32 = (0..self.robot.model.feet.len())
+                .map(|k| u32::from(self.schedule.stands(k, now_s)) << k)
+                .sum();
+            let ld: u32 =
+                (0..self.robot.model.feet.len()).map(|k| u32::from(self.sensing.feet()[k].loaded) << k).sum();
+            let r = &self.command.report;
+            std::eprintln!(
+                "{:.3} reason {} verdict {} stance {:b} loaded {:b} retimed {:b} worst {:?} {:.3} st {} row {} active {} dropped {} qp {} com {:?} pred-target dq {:.4}",
+                now_s,
+                self.command.reason,
+                self.command.verdict,
+                sch,
+                ld,
+                self.retimed,
+                r.worst_constraint(),
+                r.worst_violation,
+                r.worst_stage,
+                r.worst_row,
+                r.active_rows,
+                r.dropped_rows,
+                r.qp_solves,
+                (self.predicted.position_w - self.reference.target(0).state.position_w).as_slice(),
+                self.predicted
+                    .q
+                    .iter()
+                    .zip(&self.reference.target(0).state.q)
+                    .map(|(a, b)| (a - b).abs())
+                    .fold(0.0, f64::max)
+            );
+        }
         self.write_command(level, state, now_ns);
         let spent_ns = clock.now_ns().saturating_sub(begin);
         self.command.report.total_ns = spent_ns;
@@ -325,20 +362,19 @@ impl LeggedController {
         self.last_state_ns = Some(state.time_ns);
         self.last_sequence = state.header.sequence;
         if !self.placed {
-            self.place().map_err(|_| reason::ESTIMATOR)?;
+            self.place(self.run_time_s(state.time_ns)).map_err(|_| reason::ESTIMATOR)?;
         }
         Ok(self.run_time_s(state.time_ns))
     }
 
     /// Schedule and aims of a robot that stands where it has been measured.
-    fn place(&mut self) -> Result<(), ControlError> {
+    fn place(&mut self, measured_s: f64) -> Result<(), ControlError> {
         let model = &self.robot.model;
-        let mut places: Vec<Foothold> = self.sensing.feet().iter().map(|foot| foot.place).collect();
-        for place in &mut places {
-            *place = Foothold::level(place.position_w, place.yaw());
-        }
+        let places: Vec<Foothold> = self.sensing.feet().iter().map(|foot| foot.place).collect();
         self.schedule = ContactSchedule::standing(&places, STANCES);
         self.reference = MotionReference::new(model, self.grid.stages(), self.config.swing, &places)?;
+        self.sensing.settle(model, &self.schedule, measured_s, &mut self.measured)?;
+        self.reference.begin_at(model, &self.measured, measured_s)?;
         let aim = self.reference.aim_mut();
         match &self.config.motion {
             Motion::Stand => {}
@@ -364,8 +400,9 @@ impl LeggedController {
                 aim.mass_centre = Some(mass_centre_over(steps, &places, aim.path.origin, height, gravity));
             }
         }
-        self.ground = GroundHeight::new(&self.schedule);
-        self.height_m = self.reference.aim().height_m;
+        self.ground = GroundPlane::new(&places, &self.flat);
+        let aim = self.reference.aim();
+        self.height_m = aim.height_m - self.ground.offset_m(&aim.path.origin);
         self.placed = true;
         Ok(())
     }
@@ -377,7 +414,10 @@ impl LeggedController {
         self.retimed =
             retime(schedule, sensing.feet(), measured_s, start_s - measured_s + self.config.period_s);
         ground.update(schedule, sensing.feet(), measured_s, self.config.period_s);
-        reference.aim_mut().height_m = self.height_m + ground.offset_m();
+        let aim = reference.aim_mut();
+        let [place, ..] = aim.mass_centre_at(measured_s);
+        aim.height_m = self.height_m + ground.offset_m(&place.xy());
+        aim.lean(place.xy(), *ground.gradient());
         schedule.forget_before(measured_s - 1.0);
         if let Some(walk) = walk {
             let horizon_s: f64 = self.config.stage_lengths.iter().sum();

@@ -51,8 +51,6 @@ pub struct GaitWalk {
     pub path: BasePath,
     /// Where every foot stands under the base at home, in the path's axes, m; and its heading, rad.
     pub home: Vec<(Vector2<f64>, f64)>,
-    /// Height of the ground, m.
-    pub ground_m: f64,
     /// Next stride of every foot.
     pub stride: Vec<u32>,
 }
@@ -63,17 +61,15 @@ impl GaitWalk {
         let home = places.iter().map(|place| {
             (turned_by(&(place.position_w.xy() - path.origin), -path.yaw), place.yaw() - path.yaw)
         });
-        let ground_m =
-            places.iter().map(|place| place.position_w.z).sum::<f64>() / places.len().max(1) as f64;
-        Self { gait, path, home: home.collect(), ground_m, stride: alloc::vec![0; places.len()] }
+        Self { gait, path, home: home.collect(), stride: alloc::vec![0; places.len()] }
     }
 
-    /// The place of a foot that is at home at a time.
+    /// The place of a foot that is at home at a time, on level ground at height 0.
     pub fn home_at(&self, foot: usize, time_s: f64) -> Foothold {
         let point = self.path.at(time_s);
         let (place, yaw) = self.home[foot];
         let position = point.position + turned_by(&place, point.yaw);
-        Foothold::level(with_height(&position, self.ground_m), point.yaw + yaw)
+        Foothold::level(with_height(&position, 0.0), point.yaw + yaw)
     }
 
     /// Lays out the strides that begin before `until_s`. A foot that stands at the end of the path where it belongs lifts off no more.

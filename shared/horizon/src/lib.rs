@@ -9,7 +9,7 @@
 //! | step | module | what |
 //! |---|---|---|
 //! | robot | [`legged_model`] | floating tree, feet, limits, posture |
-//! | when and where | [`contact_schedule`], [`gait`], [`step_plan`], [`retiming`], [`ground_height`], [`stage_grid`] | stances of every foot, switch times as stage boundaries |
+//! | when and where | [`contact_schedule`], [`gait`], [`step_plan`], [`retiming`], [`ground_plane`], [`stage_grid`] | stances of every foot, switch times as stage boundaries |
 //! | aim | [`base_path`], [`mass_centre_plan`], [`leg_kinematics`], [`load_sharing`], [`motion_reference`] | where base and feet shall be, and which forces carry that |
 //! | stage | [`foot_cone`], [`motion_plan`], [`legged_tasks`], [`legged_problem`] | wrench rows, the nominal, costs and transitions |
 //!
@@ -31,7 +31,7 @@ pub mod contact_schedule;
 pub mod errors;
 pub mod foot_cone;
 pub mod gait;
-pub mod ground_height;
+pub mod ground_plane;
 pub mod leg_kinematics;
 pub mod legged_model;
 pub mod legged_problem;

@@ -33,6 +33,9 @@ const ROUNDS: usize = 2;
 /// A moment, s: longer than what makes two times one.
 const BEFORE_S: f64 = 4e-6;
 
+/// How long it takes from the begin to the aim, s.
+const SETTLED_S: f64 = 1.0;
+
 /// How long it takes to crouch, s.
 const CROUCH_S: f64 = 0.6;
 
@@ -49,9 +52,16 @@ pub struct Aim {
     pub crouch_m: f64,
     /// ... until then, s.
     pub crouched_s: f64,
+    /// Where the height is told, m, and its gradient from there on.
+    ground: (Vector2<f64>, Vector2<f64>),
 }
 
 impl Aim {
+    /// The height is that over `middle` (m); from there on it changes with `gradient`.
+    pub fn lean(&mut self, middle: Vector2<f64>, gradient: Vector2<f64>) {
+        self.ground = (middle, gradient);
+    }
+
     /// Place, velocity and acceleration of the mass centre at a time.
     pub fn mass_centre_at(&self, time_s: f64) -> [Vector3<f64>; 3] {
         let [place, velocity, acceleration] = match &self.mass_centre {
@@ -65,9 +75,11 @@ impl Aim {
         let down = part * part * part * (10.0 + part * (6.0 * part - 15.0));
         let speed = 30.0 * part * part * (1.0 - part) * (1.0 - part) / CROUCH_S;
         let change = 60.0 * part * (1.0 - part) * (1.0 - 2.0 * part) / (CROUCH_S * CROUCH_S);
+        let (middle, gradient) = &self.ground;
+        let height = self.height_m + gradient.dot(&(place - middle));
         [
-            with_height(&place, self.height_m - self.crouch_m * down),
-            with_height(&velocity, -self.crouch_m * speed),
+            with_height(&place, height - self.crouch_m * down),
+            with_height(&velocity, gradient.dot(&velocity) - self.crouch_m * speed),
             with_height(&acceleration, -self.crouch_m * change),
         ]
     }
@@ -114,6 +126,25 @@ pub struct MotionReference {
     /// From the base to the mass centre at home, in axes that only have the heading.
     to_mass_centre: Vector3<f64>,
     targets: Vec<Target>,
+    begin: Begin,
+}
+
+/// How the robot differs from its aim when it begins.
+#[derive(Clone, Copy, Debug, Default)]
+struct Begin {
+    time_s: f64,
+    /// Rotation of the base, in its axes.
+    turn: Vector3<f64>,
+    /// Mass centre, m.
+    way: Vector3<f64>,
+}
+
+impl Begin {
+    /// What is left of the difference, by minimum jerk.
+    fn left(&self, time_s: f64) -> f64 {
+        let part = ((time_s - self.time_s) / SETTLED_S).clamp(0.0, 1.0);
+        1.0 - part * part * part * (10.0 + part * (6.0 * part - 15.0))
+    }
 }
 
 impl MotionReference {
@@ -147,6 +178,7 @@ impl MotionReference {
             height_m: middle.z + mass_centre.z - middle_home.z,
             crouch_m: 0.0,
             crouched_s: 0.0,
+            ground: (Vector2::zeros(), Vector2::zeros()),
         };
         let target = Target {
             state: home.clone(),
@@ -168,7 +200,32 @@ impl MotionReference {
             upright: level * home.orientation,
             to_mass_centre: level * (mass_centre - home.position_w),
             targets: vec![target; stages + 1],
+            begin: Begin::default(),
         })
+    }
+
+    /// The robot begins in `state`: from there it goes to its aim in a second, by minimum jerk.
+    ///
+    /// # Errors
+    /// When the state does not fit the model.
+    pub fn begin_at(
+        &mut self,
+        model: &LeggedModel,
+        state: &BoundaryState,
+        time_s: f64,
+    ) -> Result<(), HorizonError> {
+        self.kinematics.update(&model.tree, state)?;
+        let [place, ..] = self.aim.mass_centre_at(time_s);
+        let aimed = rotation_z(self.aim.path.at(time_s).yaw) * self.upright;
+        self.begin = Begin {
+            time_s,
+            turn: log_rotation(&aimed.tr_mul(&state.orientation)),
+            way: self.kinematics.mass_centre_w(&model.tree) - place,
+        };
+        for target in &mut self.targets {
+            target.state.q.copy_from_slice(&state.q);
+        }
+        Ok(())
     }
 
     /// Where base and mass centre go.
@@ -222,13 +279,15 @@ impl MotionReference {
         time_s: f64,
         schedule: &ContactSchedule,
     ) -> Result<(), StepError> {
-        let Self { aim, swing, legs, targets, upright, to_mass_centre, .. } = self;
+        let Self { aim, swing, legs, targets, upright, to_mass_centre, begin, .. } = self;
         let target = &mut targets[k];
         let point = aim.path.at(time_s);
         let turn = rotation_z(point.yaw);
         let [place, velocity, _] = aim.mass_centre_at(time_s);
+        let left = begin.left(time_s);
+        let place = place + begin.way * left;
         (target.mass_centre_w, target.mass_centre_velocity_w) = (place, velocity);
-        target.state.orientation = turn * *upright;
+        target.state.orientation = turn * *upright * exp_rotation(&(begin.turn * left));
         target.state.position_w = place - turn * *to_mass_centre;
         for (foot, out) in target.feet.iter_mut().enumerate() {
             // At its touchdown a foot is still where its swing ends.
