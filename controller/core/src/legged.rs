@@ -47,9 +47,11 @@ use crate::feedback_law::Law;
 use crate::stop_watch::{Clock, StopWatch};
 
 mod law;
+mod light_feet;
 mod prediction;
 mod sensing;
 
+use light_feet::LightFeet;
 use prediction::StatePrediction;
 use sensing::LeggedSensing;
 
@@ -171,6 +173,7 @@ pub struct LeggedController {
     predicted: BoundaryState,
     scratch: BoundaryState,
     law: Law,
+    light_feet: LightFeet,
     command: Command,
     blank_report: CycleReport,
     origin_ns: u64,
@@ -230,6 +233,7 @@ impl LeggedController {
             predicted: model.posture.clone(),
             scratch: model.posture.clone(),
             law: Law::new(joints),
+            light_feet: LightFeet::new(model, config.servo_period_s)?,
             blank_report: command.report,
             command,
             origin_ns: 0,

@@ -21,6 +21,8 @@ use crate::retiming::FootState;
 
 /// Time in which a new ground is believed, s.
 const BELIEVED_S: f64 = 0.1;
+/// The same of how it leans, s: a sole rocks when it lands.
+const LEAN_BELIEVED_S: f64 = 1.0;
 /// Steepest gradient that is believed.
 const STEEPEST: f64 = 0.5;
 /// Least spread of the feet for a plane through them, m.
@@ -95,7 +97,7 @@ impl GroundPlane {
         }
         if count > 0.0 {
             if let Some(gradient) = self.gradient_of(&normal) {
-                self.gradient += (gradient - self.gradient) * share;
+                self.gradient += (gradient - self.gradient) * (period_s / LEAN_BELIEVED_S).min(1.0);
             }
             let (middle, above) = (middle / count, above / count);
             // The same plane, told from another middle.
@@ -159,7 +161,7 @@ mod tests {
             loaded: true,
             place: Foothold { position_w: Vector3::new(0.0, y, 0.01), axes_w },
         });
-        for k in 0..200 {
+        for k in 0..2000 {
             ground.update(&mut schedule, &feet, 0.005 * f64::from(k), 0.005);
         }
         assert!((ground.gradient() - Vector2::new(0.1, 0.0)).norm() < 1e-3);
@@ -180,7 +182,7 @@ mod tests {
         let mut ground = GroundPlane::new(&places, &[false; 4]);
         let feet =
             corners.map(|(x, y)| FootState { loaded: true, place: at(x, y, 0.2 * x - 0.1 * y + 0.03) });
-        for k in 0..200 {
+        for k in 0..2000 {
             ground.update(&mut schedule, &feet, 0.005 * f64::from(k), 0.005);
         }
         assert!((ground.gradient() - Vector2::new(0.2, -0.1)).norm() < 1e-3);

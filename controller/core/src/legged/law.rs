@@ -27,8 +27,10 @@ impl LeggedController {
         for level in [level, FallbackLevel::DampingOnly, FallbackLevel::ZeroTorque] {
             self.form_law(level, self.run_time_s(start_ns));
             self.command.fallback_level = level as u32;
-            let Self { law, command, .. } = self;
+            let begin_s = self.run_time_s(start_ns);
+            let Self { law, command, light_feet, schedule, .. } = self;
             write(law, command);
+            light_feet.write(|foot| schedule.stands(foot, begin_s), command);
             if command.validate(self.robot.joint_set_hash, joints).is_ok() {
                 if level > self.ladder.level() {
                     self.ladder.descend_to(level);
