@@ -42,6 +42,7 @@ pub mod controller;
 pub mod drawing;
 pub mod faults;
 pub mod input_file;
+pub mod legged_metrics;
 pub mod legged_robot;
 pub mod log;
 pub mod log_command;

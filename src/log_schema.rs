@@ -126,6 +126,10 @@ float64[3] base_angular_velocity_b
 float64[3] base_linear_velocity_b
 float64[3] com_w
 float64[3] com_velocity_w
+uint32 n_feet
+uint32 feet_touching
+float64[24] foot_position_w
+float64[8] foot_slip_m
 float64[3] sole_position_w
 float64 stance_slip_m
 float64 sole_tilt_rad

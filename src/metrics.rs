@@ -8,6 +8,7 @@ use delmpc_scenario::{Scenario, StartSettings};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
+use crate::legged_metrics::{LeggedFigures, LeggedMetrics};
 use crate::truth::Truth;
 
 /// At rest: the mass centre is horizontally this close to where it was when the last push began (m) ...
@@ -34,6 +35,7 @@ pub struct Metrics {
     /// The last truths of the base, for the estimates that come later.
     recent: VecDeque<BaseTruth>,
     estimates: EstimateErrors,
+    legged: Option<LeggedMetrics>,
 }
 
 /// Steps an estimate may be late.
@@ -111,6 +113,9 @@ pub struct RobotFigures {
     /// Root mean square of the error of the base's velocity it believed in.
     #[serde(default)]
     pub estimator_velocity_rms_m_s: Option<f64>,
+    /// What the feet did, of a robot on several feet or on its way.
+    #[serde(flatten)]
+    pub legged: Option<LeggedFigures>,
 }
 
 impl Metrics {
@@ -157,10 +162,19 @@ impl Metrics {
                 energy_balance_error: None,
                 estimator_tilt_rms_rad: None,
                 estimator_velocity_rms_m_s: None,
+                legged: None,
             },
             recent: VecDeque::with_capacity(RECENT_STEPS),
             estimates: EstimateErrors::default(),
+            legged: None,
         }
+    }
+
+    /// Of a robot on several feet, or on its way.
+    #[must_use]
+    pub fn of_feet(mut self, legged: Option<LeggedMetrics>) -> Self {
+        self.legged = legged;
+        self
     }
 
     /// Takes in the initial state (time 0) or the end of a step.
@@ -187,11 +201,19 @@ impl Metrics {
         }
         lower(&mut figures.min_com_height_m, truth.com_w[2]);
         // The path, and as a check on it the distance.
-        let slip =
-            horizontal_distance(&truth.sole_position_w, &start.sole_position_w).max(truth.stance_slip_m);
+        let slip = match &mut self.legged {
+            Some(legged) => {
+                legged.observe(truth);
+                truth.stance_slip_m
+            }
+            None => {
+                horizontal_distance(&truth.sole_position_w, &start.sole_position_w).max(truth.stance_slip_m)
+            }
+        };
         figures.max_stance_slip_m = figures.max_stance_slip_m.max(slip);
-        figures.other_foot_touched |=
-            truth.contact_flags & !start.contact_flags != 0 && start.contact_flags != 0;
+        figures.other_foot_touched |= self.legged.is_none()
+            && truth.contact_flags & !start.contact_flags != 0
+            && start.contact_flags != 0;
         if time_s >= self.judged_from_s {
             figures.max_stance_tilt_rad = figures.max_stance_tilt_rad.max(truth.sole_tilt_rad);
             lower(&mut figures.min_cop_margin_m, truth.cop_margin_m);
@@ -229,6 +251,9 @@ impl Metrics {
         if let Some(ball) = &mut self.ball {
             ball.position_m = stance_frame_w.transform_point(&ball.position_m.into()).into();
         }
+        if let Some(legged) = &mut self.legged {
+            legged.set_stance_frame(stance_frame_w);
+        }
         self
     }
 
@@ -264,6 +289,7 @@ impl Metrics {
         let rms = |sum: f64| (self.estimates.count > 0).then(|| (sum / self.estimates.count as f64).sqrt());
         figures.estimator_tilt_rms_rad = rms(self.estimates.tilt);
         figures.estimator_velocity_rms_m_s = rms(self.estimates.velocity);
+        figures.legged = self.legged.as_ref().map(LeggedMetrics::figures);
         if let Some(push_end_s) = self.push_end_s {
             // At rest at the end, with some time to show that it stays so.
             let restless_s = self.restless_s.unwrap_or(self.push_start_s);

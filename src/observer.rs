@@ -30,6 +30,7 @@ pub struct Observer {
     tree: KinematicTree,
     kinematics: Kinematics,
     sole: Attachment,
+    soles: Vec<Attachment>,
     hand: Option<Attachment>,
     effort: Vec<f64>,
 }
@@ -47,6 +48,7 @@ impl Observer {
             tree: robot.tree.clone(),
             kinematics: Kinematics::new(&robot.tree),
             sole: *robot.frame(&sole.frame).ok_or_else(missing)?,
+            soles: robot.soles.iter().filter_map(|sole| robot.frame(&sole.frame).copied()).collect(),
             hand: scenario.reach.as_ref().and_then(|reach| robot.frame(&reach.hand)).copied(),
             effort: robot.limits.iter().map(|limit| limit.effort).collect(),
         })
@@ -78,6 +80,10 @@ impl Observer {
         truth.com_velocity_w = self.kinematics.mass_centre_velocity_w(&self.tree).into();
         let sole = self.pose_w(&self.sole);
         truth.sole_position_w = sole.translation.into();
+        truth.n_feet = self.soles.len().min(truth.foot_position_w.len()) as u32;
+        for (sole, place) in self.soles.iter().zip(&mut truth.foot_position_w) {
+            *place = self.pose_w(sole).translation.into();
+        }
         if let Some(hand) = &self.hand {
             truth.hand_w = self.pose_w(hand).translation.into();
         }

@@ -69,8 +69,7 @@ pub fn simulate(setup: &Setup, log: Log, stop: &StopFlag) -> Result<Simulated, F
     let controller = FaultyController::new(RobotController::new(setup)?, scenario);
     let mut answers = Answers { controller_loop, controller, commands: commands_in };
     let blank = PlantState::new(run, hash, joints);
-    let plant_loop = PlantLoop::new(scenario, states, &mut answers, &blank, log)
-        .in_stance_frame(&setup.start()?.stance_frame_w);
+    let plant_loop = PlantLoop::new(scenario, states, &mut answers, &blank, log).judged_for(setup)?;
     match plant_loop.run(&mut robot, &mut Alone(stop.clone())) {
         Err(fault) => Ok(Simulated::Fault(fault.to_string())),
         Ok(run) => {

@@ -59,9 +59,8 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
         true => Steering::by_lines(BufReader::new(std::io::stdin()), setup.robot.tree.body_count()),
         false => Steering::none(),
     };
-    let mut plant_loop = PlantLoop::new(scenario, states, commands, &blank, log)
-        .steered(steering)
-        .in_stance_frame(&setup.start()?.stance_frame_w);
+    let mut plant_loop =
+        PlantLoop::new(scenario, states, commands, &blank, log).steered(steering).judged_for(&setup)?;
     if arguments.timing {
         plant_loop = plant_loop.recording();
     }

@@ -22,16 +22,18 @@ use delmpc_controller_process::durations::Durations;
 use delmpc_controller_process::membership::{Attendance, Order};
 use delmpc_controller_process::records::{Records, StepRecord};
 use delmpc_controller_process::usage::Usage;
-use delmpc_mechanics::prelude::RigidTransform;
 use delmpc_messages::{Command, PlantState, ProcessState, status};
 use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::{LinkError, Publisher, Subscriber};
 
+use crate::legged_metrics::LeggedMetrics;
 use crate::log::Log;
 use crate::metrics::Metrics;
+use crate::setup::Setup;
 use crate::steering::{Pull, Steering};
 use crate::summary::PlantPart;
 use crate::truth::Truth;
+use crate::verdict::Failure;
 
 /// Longest hold-up after which the plant catches up with the wall clock.
 pub const MOST_CATCH_UP_NS: u64 = 20_000_000;
@@ -209,11 +211,15 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
         self
     }
 
-    /// Judges ball and pushes in this frame.
-    #[must_use]
-    pub fn in_stance_frame(mut self, stance_frame_w: &RigidTransform) -> Self {
-        self.metrics = self.metrics.in_stance_frame(stance_frame_w);
-        self
+    /// Judges what happens by a scenario with its robot: ball, pushes and footholds in the frame of the stance, the feet by their names.
+    ///
+    /// # Errors
+    /// As [`Setup::start`].
+    pub fn judged_for(mut self, setup: &Setup) -> Result<Self, Failure> {
+        let sole = |name: &str| setup.robot.soles.iter().position(|sole| sole.name == name);
+        let legged = setup.is_legged().then(|| LeggedMetrics::new(&setup.scenario, sole));
+        self.metrics = self.metrics.of_feet(legged).in_stance_frame(&setup.start()?.stance_frame_w);
+        Ok(self)
     }
 
     /// Somebody pulls and pauses.

@@ -7,9 +7,9 @@ use delmpc_mechanics::prelude::{RigidTransform, State};
 use delmpc_messages::{ClockKind, Command, PlantState};
 use delmpc_plant::prelude as simulation;
 use delmpc_plant::prelude::{
-    ActuatorConfig, ActuatorLimits, AffineLaw, ContactOptions, ContactPoint, FallCause, Foot, GroundGive,
-    HoldingGains, InertialUnitConfig, ModelErrors, MonitorConfig, PlantConfig, PlantModel, SensorConfig,
-    Terrain, TerrainBox, TerrainGap, WatchdogConfig,
+    ActuatorConfig, ActuatorLimits, AffineLaw, ContactOptions, ContactPoint, FallCause, Foot, FootReport,
+    GroundGive, HoldingGains, InertialUnitConfig, ModelErrors, MonitorConfig, PlantConfig, PlantModel,
+    SensorConfig, Terrain, TerrainBox, TerrainGap, WatchdogConfig,
 };
 use delmpc_robots::{Geometry, RobotModel, ShapeRole};
 use delmpc_scenario::{Clock, PushSettings, Scenario};
@@ -33,6 +33,8 @@ pub struct SimulatedRobot {
     pull_w: Vector3<f64>,
     clock: ClockKind,
     body_names: Vec<String>,
+    /// On several feet, or on its way.
+    is_legged: bool,
 }
 
 impl SimulatedRobot {
@@ -64,6 +66,7 @@ impl SimulatedRobot {
             pull_w: Vector3::zeros(),
             clock,
             body_names: robot.body_names.clone(),
+            is_legged: setup.is_legged(),
         })
     }
 }
@@ -127,10 +130,35 @@ impl Plant for SimulatedRobot {
             truth.cop_margin_m = foot.pressure_margin.unwrap_or(f64::NAN);
             truth.friction_use = foot.pressure_margin.map_or(f64::NAN, |_| foot.friction_use);
         }
+        truth.feet_touching = 0;
+        for (k, foot) in monitor.reports().iter().take(truth.foot_slip_m.len()).enumerate() {
+            truth.foot_slip_m[k] = foot.slip;
+            truth.feet_touching |= u32::from(foot.touching) << k;
+            if self.is_legged {
+                judge_foot(foot, k == 0, truth);
+            }
+        }
         let totals = monitor.totals();
         // Relative to the energy moved; the first joule counts as a joule.
         truth.energy_balance_error = totals.energy_balance_error().abs() / totals.energy_moved.max(1.0);
         truth.push_force_w = (self.push_force_w(truth.time_ns) + self.pull_w).into();
+    }
+}
+
+/// Of several feet the worst one that carries load counts: tilt, pressure point, friction.
+fn judge_foot(foot: &FootReport, is_first: bool, truth: &mut Truth) {
+    if is_first {
+        (truth.sole_tilt_rad, truth.stance_slip_m) = (0.0, 0.0);
+        (truth.cop_margin_m, truth.friction_use) = (f64::NAN, f64::NAN);
+    }
+    truth.stance_slip_m = truth.stance_slip_m.max(foot.slip);
+    if foot.pressure_point.is_none() {
+        return;
+    }
+    truth.friction_use = truth.friction_use.max(foot.friction_use);
+    if let Some(margin) = foot.pressure_margin {
+        truth.sole_tilt_rad = truth.sole_tilt_rad.max(foot.tilt);
+        truth.cop_margin_m = truth.cop_margin_m.min(margin);
     }
 }
 

@@ -1,7 +1,7 @@
 //! What really happened in a step, as opposed to what the sensors said: one record of the log, and what the figures are made of.
 
 use bytemuck::{Pod, Zeroable};
-use delmpc_messages::MAX_JOINTS;
+use delmpc_messages::{MAX_FEET, MAX_JOINTS};
 
 /// The truth at the end of one plant step. Plain data without padding, like the messages; frames and order are theirs too.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
@@ -35,6 +35,14 @@ pub struct Truth {
     pub com_w: [f64; 3],
     /// Its velocity (m/s).
     pub com_velocity_w: [f64; 3],
+    /// Feet in use, the first ones of each array.
+    pub n_feet: u32,
+    /// Bit i is set while foot i touches the ground.
+    pub feet_touching: u32,
+    /// Origins of all soles (m).
+    pub foot_position_w: [[f64; 3]; MAX_FEET],
+    /// Paths of their contact patches along the ground since they touched down (m).
+    pub foot_slip_m: [f64; MAX_FEET],
     /// Origin of the stance sole (m).
     pub sole_position_w: [f64; 3],
     /// Path of the sole's contact patch along the ground since it touched down (m).

@@ -2,7 +2,8 @@
 //!
 //! 1. The mass centre goes along a path, or over the feet as a walk has it; the base is turned along with the path.
 //! 2. The feet are where the schedule has them; one that swings goes by minimum jerk from the one place to the other, lifted by
-//!    `16 h s² (1-s)²`, and ends a little below the ground.
+//!    `16 h τ² (1-τ)²`, `τ` from 0 to 1 over the swing, and ends a little below the ground. It is over its foothold somewhat before it
+//!    lands: a foot that lands early lands there too.
 //! 3. The legs follow by inverse kinematics, and the base moves until the mass centre is where it shall be.
 //! 4. The feet that stand share what carries the mass centre and accelerates it; joint torques are those that hold the posture
 //!    under these forces.
@@ -32,6 +33,9 @@ const ROUNDS: usize = 2;
 
 /// A moment, s: longer than what makes two times one.
 const BEFORE_S: f64 = 4e-6;
+
+/// Part of a swing after which the foot is over its foothold.
+const OVER_FOOTHOLD: f64 = 0.85;
 
 /// How long it takes from the begin to the aim, s.
 const SETTLED_S: f64 = 1.0;
@@ -360,10 +364,11 @@ impl MotionReference {
 pub fn swing_place(swing: &Swing, shape: &SwingShape, time_s: f64) -> Foothold {
     let part = ((time_s - swing.begin_s) / (swing.end_s - swing.begin_s)).clamp(0.0, 1.0);
     let part = if part.is_finite() { part } else { 1.0 };
-    let s = part * part * part * (10.0 + part * (6.0 * part - 15.0));
-    let lift = 16.0 * shape.lift_m * s * s * (1.0 - s) * (1.0 - s);
+    let minimum_jerk = |x: f64| x * x * x * (10.0 + x * (6.0 * x - 15.0));
+    let s = minimum_jerk((part / OVER_FOOTHOLD).min(1.0));
+    let lift = 16.0 * shape.lift_m * part * part * (1.0 - part) * (1.0 - part);
     let mut position_w = swing.from.position_w * (1.0 - s) + swing.to.position_w * s;
-    position_w.z += lift - shape.depth_m * s;
+    position_w.z += lift - shape.depth_m * minimum_jerk(part);
     let turn = log_rotation(&swing.from.axes_w.tr_mul(&swing.to.axes_w));
     Foothold { position_w, axes_w: swing.from.axes_w * exp_rotation(&(turn * s)) }
 }
