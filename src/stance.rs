@@ -48,6 +48,7 @@ pub fn stances(robot: &RobotModel) -> Result<(String, Vec<String>), ModelError> 
         return Ok((String::new(), Vec::new()));
     }
     let (mut text, mut warnings) = (String::new(), undriven(robot));
+    warnings.extend(crate::check::clamp_efforts(&mut robot.clone()));
     if robot.soles.is_empty() || robot.postures.is_empty() {
         let table = robot.file.with_extension("toml");
         let missing = if robot.soles.is_empty() { "sole" } else { "posture" };
@@ -185,6 +186,12 @@ pub fn undriven(robot: &RobotModel) -> Vec<String> {
         } else if limit.velocity <= 0.0 {
             Some(format!(
                 "joint `{name}` has velocity 0, so it cannot move: give its <limit> the largest there is"
+            ))
+        } else if limit.lower >= limit.upper {
+            Some(format!(
+                "the joint {name} has no range ({} .. {}): make its type \"fixed\", or lock it in the companion table, [locked] {name} = \
+                 {:?}",
+                limit.lower, limit.upper, limit.lower
             ))
         } else {
             None

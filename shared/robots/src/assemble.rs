@@ -389,6 +389,7 @@ impl Assembly<'_> {
             links,
             shapes,
             meshes,
+            mesh_folder: None,
             contacts: Vec::new(),
             frames: Vec::new(),
             soles: Vec::new(),

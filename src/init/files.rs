@@ -1,0 +1,352 @@
+//! The texts that `delmpc init` writes: companion table and scenario, with a word on every key.
+
+use std::fmt::Write as _;
+use std::path::PathBuf;
+
+use delmpc_mechanics::kinematics::{Configuration, Kinematics};
+use delmpc_mechanics::prelude::{JointKind, RigidTransform};
+use delmpc_robots::RobotModel;
+use nalgebra::{Rotation3, Vector3};
+
+use crate::init::feet::FoundFoot;
+use crate::init::posture::{Standing, leg_joints};
+
+/// What the companion table says.
+#[derive(Debug, Clone, Default)]
+pub struct Table {
+    /// Where the meshes of the URDF are.
+    pub mesh_folder: Option<PathBuf>,
+    /// Whether impossible inertias are accepted.
+    pub accept_impossible_inertia: bool,
+    /// Joints that do not move: name, place, why.
+    pub locked: Vec<(String, f64, &'static str)>,
+    /// Feet.
+    pub feet: Vec<FoundFoot>,
+    /// Hands: name, link, point in it.
+    pub hands: Vec<(String, String, Vector3<f64>)>,
+    /// Posture and the joints it is over.
+    pub posture: Option<(Standing, Vec<String>)>,
+    /// What should be known.
+    pub notes: Vec<String>,
+}
+
+impl Table {
+    /// The table as TOML.
+    pub fn text(&self) -> String {
+        let mut text = String::from(
+            "# What the URDF beside it cannot say: soles, hands, a posture. Written by `delmpc init`; change it as you like.\n\
+             # Lengths in m, angles in rad; points and frames are in the axes of their link.\n\
+             format = 1\n",
+        );
+        if let Some(folder) = &self.mesh_folder {
+            let folder = folder.display().to_string();
+            let _ = writeln!(
+                text,
+                "\n# Where the names of its mesh files are relative to; they are only drawn.\nmesh_folder = {}",
+                quoted(&folder)
+            );
+        }
+        if self.accept_impossible_inertia {
+            text.push_str("\n# It has inertias that no body has, or joints that carry no mass: they are taken as they are, and held.\naccept_impossible_inertia = true\n");
+        }
+        if !self.locked.is_empty() {
+            text.push_str("\n# Joints that do not move, and where they stand.\n[locked]\n");
+            for (name, at, why) in &self.locked {
+                let _ = writeln!(text, "{} = {at:?} # {why}", quoted(name));
+            }
+        }
+        for foot in &self.feet {
+            foot_text(&mut text, foot);
+        }
+        for (name, link, at) in &self.hands {
+            let _ = write!(
+                text,
+                "\n# The end of an arm: what a ball is fetched with.\n[[frame]]\nname = {}\nlink = {}\nposition_m = {}\n",
+                quoted(name),
+                quoted(link),
+                list(at.iter())
+            );
+        }
+        if let Some((standing, joints)) = &self.posture {
+            let rotation = Rotation3::from_matrix_unchecked(standing.base_link.rotation);
+            let (roll, pitch, yaw) = rotation.euler_angles();
+            let _ = write!(
+                text,
+                "\n# Where it stands at rest: the root link in a world whose origin is the middle of the sole, x forward, z up. The mass centre\n\
+                 # is over the middle of the sole. Solved by inverse kinematics; joints that are not named are at 0.\n\
+                 [[posture]]\nname = \"stand\"\nbase_position_m = {}\nbase_rpy_rad = {}\n[posture.joints]\n",
+                exact(standing.base_link.translation.iter()),
+                exact([roll, pitch, yaw].iter())
+            );
+            for (name, value) in joints.iter().zip(&standing.q).filter(|(_, value)| **value != 0.0) {
+                let _ = writeln!(text, "{} = {value:?}", quoted(name));
+            }
+        }
+        text
+    }
+}
+
+fn foot_text(text: &mut String, foot: &FoundFoot) {
+    let FoundFoot { name, link, frame, corners, from } = foot;
+    let _ =
+        write!(text, "\n# Sole `{name}`, found in the {from} of {link}: points that touch the ground ...\n");
+    for (index, corner) in corners.iter().enumerate() {
+        let at = frame.transform_point(&Vector3::new(corner.x, corner.y, 0.0));
+        let _ = write!(
+            text,
+            "[[contact]]\nname = \"{name}_{index}\"\nlink = {}\nposition_m = {}\n",
+            quoted(link),
+            exact(at.iter())
+        );
+    }
+    let (roll, pitch, yaw) = Rotation3::from_matrix_unchecked(frame.rotation).euler_angles();
+    let corners: Vec<String> = (0..corners.len()).map(|index| format!("\"{name}_{index}\"")).collect();
+    let _ = write!(
+        text,
+        "# ... its frame: in the middle, x forward, z up ...\n[[frame]]\nname = \"{name}_sole\"\nlink = {}\nposition_m = {}\n\
+         rpy_rad = {}\n# ... and its corners, counter-clockwise from above: the pressure point has to stay between them.\n\
+         [[sole]]\nname = \"{name}\"\nframe = \"{name}_sole\"\ncorners = [{}]\n",
+        quoted(link),
+        exact(frame.translation.iter()),
+        exact([roll, pitch, yaw].iter()),
+        corners.join(", ")
+    );
+}
+
+fn quoted(name: &str) -> String {
+    toml_string(name)
+}
+
+/// A text as TOML writes it.
+fn toml_string(text: &str) -> String {
+    let mut quoted = String::from("\"");
+    for c in text.chars() {
+        match c {
+            '"' | '\\' => quoted.extend(['\\', c]),
+            c if c.is_control() => {
+                let _ = write!(quoted, "\\u{:04X}", u32::from(c));
+            }
+            c => quoted.push(c),
+        }
+    }
+    quoted.push('"');
+    quoted
+}
+
+fn exact<'a>(values: impl Iterator<Item = &'a f64>) -> String {
+    let words: Vec<String> = values.map(|value| format!("{:?}", value + 0.0)).collect();
+    format!("[{}]", words.join(", "))
+}
+
+fn list<'a>(values: impl Iterator<Item = &'a f64>) -> String {
+    let words: Vec<String> = values.map(|value| format!("{:?}", (value * 1e4).round() / 1e4 + 0.0)).collect();
+    format!("[{}]", words.join(", "))
+}
+
+/// Ends of arms: bodies that carry none, are no foot, and hang on a chain of at least three joints beside the legs. Left and right.
+pub fn hands(robot: &RobotModel) -> Vec<(String, String, Vector3<f64>)> {
+    let tree = &robot.tree;
+    let legs = leg_joints(robot);
+    let first = tree.first_joint_body();
+    let carries = |body: usize| tree.bodies().iter().any(|other| other.parent == Some(body));
+    let mut ends: Vec<(usize, f64, Vector3<f64>)> = Vec::new();
+    let mut kinematics = Kinematics::new(tree);
+    let zeros = vec![0.0; robot.joint_names.len()];
+    let configuration = Configuration::floating(RigidTransform::identity(), &zeros);
+    if kinematics.update_positions(tree, &configuration).is_err() {
+        return Vec::new();
+    }
+    for body in (first..tree.body_count()).filter(|body| !carries(*body)) {
+        // Turning joints on the way to the trunk, none of a leg.
+        let (mut at, mut length) = (Some(body), 0);
+        let mut shoulder = body;
+        while let Some(here) =
+            at.filter(|here| *here >= first && !legs.contains(&robot.joint_names[here - first]))
+        {
+            length += usize::from(tree.bodies()[here].joint.kind == JointKind::Revolute);
+            shoulder = here;
+            at = tree.bodies()[here].parent;
+        }
+        let poses = kinematics.link_poses_w();
+        let com = tree.bodies()[body].inertia.com;
+        let place = poses[body].transform_point(&com);
+        let span = (place - poses[shoulder].translation).norm();
+        // A head has two joints, an arm three or more. It does not stand on the ground.
+        let is_foot =
+            robot.soles.iter().any(|sole| robot.frame(&sole.frame).and_then(|f| f.body) == Some(body));
+        if length >= 3 && !is_foot {
+            ends.push((body, span, place));
+        }
+    }
+    let base = kinematics.link_poses_w().first().copied().unwrap_or_default();
+    let side = |end: &(usize, f64, Vector3<f64>)| (base.inverse().transform_point(&end.2)).y;
+    let mut hands = Vec::new();
+    for (name, sign) in [("left_hand", 1.0), ("right_hand", -1.0)] {
+        let longest = ends.iter().filter(|end| sign * side(end) > 0.02).max_by(|a, b| a.1.total_cmp(&b.1));
+        if let Some((body, ..)) = longest {
+            let link = robot.body_names[*body].clone();
+            hands.push((name.to_owned(), link, tree.bodies()[*body].inertia.com));
+        }
+    }
+    hands
+}
+
+/// The hands in the posture `stand`, in the frame of the sole; the one beside the standing leg last.
+pub fn hands_at_home(robot: &RobotModel, sole: &str) -> Vec<(String, Vector3<f64>)> {
+    let posture = robot.posture("stand");
+    let Some((posture, base)) = posture.and_then(|posture| Some((posture, robot.base_pose_w(posture)?)))
+    else {
+        return Vec::new();
+    };
+    let mut kinematics = Kinematics::new(&robot.tree);
+    if kinematics.update_positions(&robot.tree, &Configuration::floating(base, &posture.q)).is_err() {
+        return Vec::new();
+    }
+    let mut hands: Vec<(String, Vector3<f64>)> = robot
+        .frames
+        .iter()
+        .filter(|frame| frame.name.ends_with("_hand"))
+        .filter_map(|frame| {
+            let body = frame.attachment.body?;
+            let pose = kinematics.link_poses_w()[body] * frame.attachment.pose;
+            Some((frame.name.clone(), pose.translation))
+        })
+        .collect();
+    hands.sort_by_key(|(name, _)| name.starts_with(sole));
+    hands
+}
+
+/// What the scenario is scaled by.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Size {
+    /// Mass, kg.
+    pub mass: f64,
+    /// Height of the mass centre over the sole, m.
+    pub height: f64,
+    /// Distances of the mass centre from the front and from the outer edge of the sole, m.
+    pub to_edge: [f64; 2],
+    /// Mean distance of the sole's corners from its middle, m.
+    pub corner: f64,
+    /// Median effort of the legs' joints over weight times height.
+    pub effort: f64,
+}
+
+/// The robot whose weights are the defaults: Atlas.
+const REFERENCE_HEIGHT_M: f64 = 1.0;
+const REFERENCE_EFFORT: f64 = 0.25;
+const REFERENCE_WEIGHT_N: f64 = 1717.0;
+
+impl Size {
+    /// Of a robot on a sole.
+    pub fn of(robot: &RobotModel, sole: &str, standing: &Standing) -> Self {
+        let mass = robot.tree.total_mass();
+        let polygon = robot.sole(sole).map_or(&[][..], |sole| sole.polygon.as_slice());
+        let reach = |direction: [f64; 2]| {
+            let along = polygon.iter().map(|corner| corner.x * direction[0] + corner.y * direction[1]);
+            along.fold(0.0, f64::max)
+        };
+        let corner = polygon.iter().map(|corner| corner.norm()).sum::<f64>() / polygon.len().max(1) as f64;
+        let legs = leg_joints(robot);
+        let weight = mass * robot.tree.gravity_w().norm();
+        let mut efforts: Vec<f64> = legs
+            .iter()
+            .filter_map(|name| Some(robot.limits[robot.joint(name)?].effort))
+            .filter(|effort| effort.is_finite())
+            .map(|effort| effort / (weight * standing.com.z))
+            .collect();
+        efforts.sort_by(f64::total_cmp);
+        let effort = efforts.get(efforts.len() / 2).copied().unwrap_or(REFERENCE_EFFORT);
+        let to_edge = [reach([1.0, 0.0]), reach([0.0, 1.0]).min(reach([0.0, -1.0]))];
+        Self { mass, height: standing.com.z, to_edge, corner, effort }
+    }
+
+    /// What an inverted pendulum on the sole survives at most when pushed forward, N s.
+    pub fn capture_limit_forward(&self) -> f64 {
+        self.mass * (9.81 / self.height).sqrt() * self.to_edge[0]
+    }
+}
+
+/// The scenario; the ball with the hand that fetches it.
+pub fn scenario_text(
+    robot: &RobotModel,
+    stem: &str,
+    sole: &str,
+    size: &Size,
+    ball: Option<(&str, [f64; 3])>,
+) -> String {
+    let scale = REFERENCE_HEIGHT_M / size.height;
+    let weight = size.mass * 9.81;
+    let round = |value: f64| {
+        // Three digits are enough for anybody who changes them.
+        let unit = 10_f64.powf(2.0 - value.abs().max(1e-12).log10().floor());
+        (value * unit).round() / unit
+    };
+    let mut text = format!(
+        "# {} stands on its sole `{sole}`{}, takes a push, and stays up. Written by `delmpc init`; change it as you like.\n\
+         # A key that is not here has a default: `delmpc run` leaves all of them in scenario.toml of the run's folder.\n\
+         seed = 1                       # of everything random\n\
+         duration_s = 8.0\n\n\
+         [robot]\n\
+         urdf = {}\n\
+         stance = \"{sole}\"              # sole of the companion table that it stands on\n\
+         posture = \"stand\"             # posture of the companion table that it begins and rests in\n",
+        robot.name,
+        if ball.is_some() { ", fetches a ball" } else { "" },
+        toml_string(&format!("{stem}.urdf")),
+    );
+    let noise = weight / REFERENCE_WEIGHT_N;
+    let _ = write!(
+        text,
+        "\n[sensors]\n\
+         foot_force_noise_n = {:?}      # in proportion to its weight\n\
+         foot_torque_noise_nm = {:?}\n",
+        round(2.0 * noise),
+        round(0.2 * noise * size.height / REFERENCE_HEIGHT_M),
+    );
+    let com = round(2000.0 * scale * scale);
+    let com_velocity = round(200.0 * scale);
+    let torque = round((500.0 * (size.effort / REFERENCE_EFFORT).powi(2)).clamp(1.0, 1e5));
+    let _ = write!(
+        text,
+        "\n# Weights: one over the square of what counts 1. Lengths are those of its height ({:.2} m to the mass centre), torques those of\n\
+         # its weight ({weight:.0} N).\n\
+         [controller.weights]\n\
+         com_per_m2 = [{com:?}, {com:?}, 0.0]\n\
+         com_velocity_s2_per_m2 = [{com_velocity:?}, {com_velocity:?}, 0.0]\n\
+         joint_speed_s2_per_rad2 = {:?}\n\
+         torque_per_limit2 = {torque:?}\n\
+         hand_per_m2 = {:?}\n\
+         swing_foot_per_m2 = [0.0, 0.0, {:?}]\n",
+        size.height,
+        round(0.5 / scale),
+        round(10_000.0 * scale * scale),
+        round(1000.0 * scale * scale),
+    );
+    let _ = write!(
+        text,
+        "\n[controller.constraints]\n\
+         yaw_arm_m = {:?}               # yaw torque per vertical force that the sole bears by friction\n\
+         cop_margin_m = {:?}            # distance that the plan keeps from the edge of the sole\n",
+        round(0.6 * 0.7 * size.corner),
+        round((0.003_f64).min(0.05 * size.to_edge[1])),
+    );
+    if let Some((hand, at)) = ball {
+        let at = list(at.iter());
+        let _ = write!(
+            text,
+            "\n# A ball 10 cm from where the hand rests, in the frame of the sole.\n\
+             [reach]\nhand = \"{hand}\"\nball_m = {at}\nstart_s = 1.0                  # when the motion begins\n\
+             deadline_s = 1.5               # how long it may take\nhold_s = 0.8                   # how long the hand stays\n\
+             return_s = 1.2                 # how long the way back takes\n",
+        );
+    }
+    let _ = write!(
+        text,
+        "\n# Half of what an inverted pendulum on this sole survives when pushed forward, on the root link.\n\
+         [push]\nlink = {}\ndirection = [1.0, 0.0, 0.0]     # in the frame of the sole: x forward, y left, z up\n\
+         impulse_ns = {:?}\nstart_s = 5.0\nduration_s = 0.1\n",
+        toml_string(robot.body_names.first().map_or("", String::as_str)),
+        round(0.5 * size.capture_limit_forward()),
+    );
+    text
+}
