@@ -137,8 +137,8 @@ fn make(urdf: &Path, text: &str, stand: Stand) -> Result<Made, Failure> {
             named(format!("{} soles ({}), and none to stand on alone", found.len(), found.join(", ")))
         })?
         .to_owned();
+    let robot = load(&table)?;
     table.hands = files::hands(&robot);
-    let robot = load(&table).map(|_| robot)?;
     let standing = posture::stand_on(&robot, &sole).map_err(named)?;
     table.posture = Some((standing.clone(), robot.joint_names.clone()));
     let robot = load(&table)?;

@@ -7,7 +7,7 @@ use delmpc_mechanics::errors::ModelError;
 use delmpc_mechanics::kinematics::{Configuration, Kinematics};
 use delmpc_mechanics::prelude::RigidTransform;
 use delmpc_robots::{Geometry, RobotModel, ShapeRole};
-use nalgebra::{Vector2, Vector3};
+use nalgebra::{Matrix3, Vector2, Vector3};
 
 use crate::mesh_file;
 
@@ -20,6 +20,8 @@ const SOLE_PART: f64 = 0.4;
 /// Corners of a sole are left out as long as it loses no more than this part of its area.
 const LOST_AREA: f64 = 0.04;
 const MOST_CORNERS: usize = 8;
+/// Soles nearer than this to their ankles say nothing of where the front is, m.
+const NO_HEADING_M: f64 = 0.005;
 /// Points around a round shape.
 const AROUND: usize = 16;
 
@@ -96,22 +98,40 @@ pub fn find_feet(robot: &RobotModel) -> Result<Vec<FoundFoot>, NoFeet> {
         cloud.points_w.iter().any(|point| point.z - lowest <= NEAR_GROUND * (highest - lowest))
     };
     let standing: Vec<&Cloud> = clouds.iter().filter(on_ground).collect();
-    let mut feet: Vec<(f64, FoundFoot)> =
-        standing.iter().filter_map(|cloud| foot(robot, cloud, &poses[cloud.body])).collect();
-    if feet.is_empty() {
+    let soles: Vec<(&Cloud, Sole)> =
+        standing.iter().filter_map(|cloud| Some((*cloud, sole(cloud)?))).collect();
+    if soles.is_empty() {
         let links: Vec<&str> = standing.iter().map(|cloud| robot.body_names[cloud.body].as_str()).collect();
         return Err(NoFeet::Points { count: links.len(), links: links.join(", ") });
     }
-    feet.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let count = feet.len();
-    let name = |index: usize, y: f64| match (count, y > 0.0) {
+    // Toes are farther from the ankle than heels, and the sides of two feet cancel each other.
+    let ahead: Vector2<f64> =
+        soles.iter().map(|(cloud, sole)| sole.middle - poses[cloud.body].translation.xy()).sum();
+    let forward = heading(&ahead);
+    let left = |sole: &Sole| forward.perp(&sole.middle);
+    let mut soles = soles;
+    soles.sort_by(|a, b| left(&a.1).total_cmp(&left(&b.1)));
+    let name = |index: usize| match (soles.len(), index) {
         (1, _) => "foot".to_owned(),
-        (2, false) => "right".to_owned(),
-        (2, true) => "left".to_owned(),
+        (2, 0) => "right".to_owned(),
+        (2, _) => "left".to_owned(),
         _ => format!("foot_{index}"),
     };
-    let named = feet.into_iter().enumerate();
-    Ok(named.map(|(index, (y, foot))| FoundFoot { name: name(index, y), ..foot }).collect())
+    let feet = soles.iter().enumerate().filter_map(|(index, (cloud, sole))| {
+        foot(robot, cloud, sole, &forward, &poses[cloud.body], name(index))
+    });
+    Ok(feet.collect())
+}
+
+/// The axis of the root link nearest to a direction; x when there is none.
+fn heading(ahead: &Vector2<f64>) -> Vector2<f64> {
+    if ahead.norm() < NO_HEADING_M {
+        Vector2::x()
+    } else if ahead.x.abs() >= ahead.y.abs() {
+        Vector2::new(ahead.x.signum(), 0.0)
+    } else {
+        Vector2::new(0.0, ahead.y.signum())
+    }
 }
 
 /// Points of the shapes of one body.
@@ -166,11 +186,17 @@ fn underside(geometry: &Geometry, pose_w: &RigidTransform) -> Vec<Vector3<f64>> 
     }
 }
 
-/// The flat underside of a body, and where it is to the left.
-fn foot(robot: &RobotModel, cloud: &Cloud, body_w: &RigidTransform) -> Option<(f64, FoundFoot)> {
-    let ground = cloud.points_w.iter().map(|point| point.z).fold(f64::INFINITY, f64::min);
+/// The flat underside of a body, in the world.
+struct Sole {
+    corners: Vec<Vector2<f64>>,
+    middle: Vector2<f64>,
+    height: f64,
+}
+
+fn sole(cloud: &Cloud) -> Option<Sole> {
+    let height = cloud.points_w.iter().map(|point| point.z).fold(f64::INFINITY, f64::min);
     let within = |depth: f64| {
-        let near = cloud.points_w.iter().filter(|point| point.z - ground <= depth);
+        let near = cloud.points_w.iter().filter(|point| point.z - height <= depth);
         hull(&near.map(Vector3::xy).collect::<Vec<_>>())
     };
     // What the foot covers up to a few centimetres above the ground.
@@ -180,22 +206,33 @@ fn foot(robot: &RobotModel, cloud: &Cloud, body_w: &RigidTransform) -> Option<(f
         values().fold(f64::NEG_INFINITY, f64::max) - values().fold(f64::INFINITY, f64::min)
     };
     let covered = size(0) * size(1);
-    let soles = SOLE_DEPTH_M.iter().map(|depth| within(*depth));
-    let sole = soles.into_iter().find(|sole| sole.len() >= 3 && area(sole) >= SOLE_PART * covered)?;
-    // A strip of a millimetre is an edge.
-    if !(covered > 0.0 && size(0).min(size(1)) > 0.01) {
+    let mut soles = SOLE_DEPTH_M.iter().map(|depth| within(*depth));
+    let sole = soles.find(|sole| sole.len() >= 3 && area(sole) >= SOLE_PART * covered)?;
+    // A strip of a centimetre is an edge.
+    if size(0).min(size(1)) < 0.01 {
         return None;
     }
-    let sole = few_corners(sole);
-    let centre = centroid(&sole);
-    // World axes at the sole's middle, which are those of the root link.
-    let frame_w = RigidTransform::from_translation(Vector3::new(centre.x, centre.y, ground));
-    // In the first link of the body: the one its joint carries.
-    let link = robot.body_names.get(cloud.body)?;
-    let link_w = *body_w * robot.link(link)?.pose;
-    let corners = sole.iter().map(|corner| corner - centre).collect();
-    let frame = link_w.inverse() * frame_w;
-    Some((centre.y, FoundFoot { name: String::new(), link: link.clone(), frame, corners, from: cloud.from }))
+    let corners = few_corners(sole);
+    Some(Sole { middle: centroid(&corners), corners, height })
+}
+
+fn foot(
+    robot: &RobotModel,
+    cloud: &Cloud,
+    sole: &Sole,
+    forward: &Vector2<f64>,
+    body_w: &RigidTransform,
+    name: String,
+) -> Option<FoundFoot> {
+    let rotation = Matrix3::new(forward.x, -forward.y, 0.0, forward.y, forward.x, 0.0, 0.0, 0.0, 1.0);
+    let translation = Vector3::new(sole.middle.x, sole.middle.y, sole.height);
+    let frame_w = RigidTransform { rotation, translation };
+    // The link that the body's joint carries.
+    let link = robot.body_names.get(cloud.body)?.clone();
+    let frame = (*body_w * robot.link(&link)?.pose).inverse() * frame_w;
+    let turn = rotation.fixed_view::<2, 2>(0, 0).transpose();
+    let corners = sole.corners.iter().map(|corner| turn * (corner - sole.middle)).collect();
+    Some(FoundFoot { name, link, frame, corners, from: cloud.from })
 }
 
 /// Convex hull, counter-clockwise, without corners on its edges (Andrew's monotone chain). O(n log n).
@@ -251,7 +288,8 @@ pub fn area(polygon: &[Vector2<f64>]) -> f64 {
     0.5 * polygon.iter().zip(next).map(|(a, b)| a.perp(b)).sum::<f64>()
 }
 
-fn centroid(polygon: &[Vector2<f64>]) -> Vector2<f64> {
+/// Middle of the area of a counter-clockwise polygon.
+pub fn centroid(polygon: &[Vector2<f64>]) -> Vector2<f64> {
     let next = polygon.iter().cycle().skip(1);
     let moment: Vector2<f64> = polygon.iter().zip(next).map(|(a, b)| (a + b) * a.perp(b)).sum();
     moment / (6.0 * area(polygon))

@@ -178,8 +178,17 @@ pub fn hands(robot: &RobotModel) -> Vec<(String, String, Vector3<f64>)> {
             ends.push((body, span, place));
         }
     }
-    let base = kinematics.link_poses_w().first().copied().unwrap_or_default();
-    let side = |end: &(usize, f64, Vector3<f64>)| (base.inverse().transform_point(&end.2)).y;
+    // Left is where the left of the soles is.
+    let poses = kinematics.link_poses_w();
+    let base = poses.first().copied().unwrap_or_default();
+    let left_w = robot.soles.first().and_then(|sole| robot.frame(&sole.frame)).map_or_else(
+        || base.rotation.column(1).into_owned(),
+        |frame| {
+            let body = frame.body.map_or_else(RigidTransform::identity, |body| poses[body]);
+            (body * frame.pose).rotation.column(1).into_owned()
+        },
+    );
+    let side = |end: &(usize, f64, Vector3<f64>)| left_w.dot(&(end.2 - base.translation));
     let mut hands = Vec::new();
     for (name, sign) in [("left_hand", 1.0), ("right_hand", -1.0)] {
         let longest = ends.iter().filter(|end| sign * side(end) > 0.02).max_by(|a, b| a.1.total_cmp(&b.1));

@@ -9,12 +9,14 @@
 //! | every joint from where it would rather be | 3 rad (or m) |
 //!
 //! Joints stay a part of their range away from their stops. Where they would rather be: 0 if that is well inside the range, else the nearest
-//! place that is; joints that carry no leg keep a quarter of their range, so that elbows are bent and arms hang free of the trunk.
+//! place that is; knees are bent; joints that carry no leg keep a quarter of their range, so that elbows are bent and arms hang free of the trunk.
 
 use delmpc_mechanics::kinematics::{Configuration, Kinematics};
 use delmpc_mechanics::prelude::RigidTransform;
 use delmpc_robots::{JointLimits, RobotModel};
-use nalgebra::{DMatrix, DVector, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix3, Vector2, Vector3};
+
+use crate::init::feet::centroid;
 
 const COM: f64 = 100.0;
 const UPRIGHT: f64 = 10.0;
@@ -27,10 +29,15 @@ const LEG_MARGIN: f64 = 0.05;
 const OTHER_MARGIN: f64 = 0.25;
 /// Height of the root link over the soles, as a part of that with all joints at zero.
 const BENT: f64 = 0.95;
+/// A joint of a leg that goes less than this beyond 0 to one side is a knee, and where it would rather be, rad.
+const ONE_SIDED: f64 = 0.2;
+const KNEE: f64 = 0.6;
 /// How high the other foot hangs, as a part of that height.
 const LIFT: f64 = 0.06;
 /// Longest step of a joint, rad.
 const STEP: f64 = 0.3;
+/// Levenberg's.
+const DAMPING: f64 = 1e-3;
 const MOST_STEPS: usize = 300;
 /// Mass centre this near to where it should be, m, is good enough.
 const GOOD_M: f64 = 0.005;
@@ -50,8 +57,13 @@ pub struct Standing {
 struct Problem<'a> {
     standing: &'a RobotModel,
     root: String,
-    /// Root link's rotation in which it is upright: as with all joints at zero.
+    /// Where the mass centre belongs, in the frame of the sole, m.
+    middle: Vector2<f64>,
+    /// Height of the root link over the sole, m.
     height: f64,
+    /// Rotation of the root link with all joints at zero, when it is upright.
+    upright: Matrix3<f64>,
+    /// The other sole's frame and its place.
     swing: Option<(String, Vector3<f64>)>,
     lower: DVector<f64>,
     upper: DVector<f64>,
@@ -73,8 +85,7 @@ pub fn stand_on(robot: &RobotModel, sole: &str) -> Result<Standing, String> {
     let mut problem = Problem::new(robot, &rooted.model, sole)?;
     let q = problem.solve();
     let (com, base_link) = problem.stands(&q);
-    let middle = middle(&stance.polygon);
-    let off = (com.xy() - middle).norm();
+    let off = (com.xy() - problem.middle).norm();
     if off > GOOD_M {
         return Err(format!(
             "no posture on sole `{sole}` brings the mass centre over it: {:.0} mm are left",
@@ -88,10 +99,6 @@ pub fn stand_on(robot: &RobotModel, sole: &str) -> Result<Standing, String> {
         }
     }
     Ok(Standing { q: floating, base_link, com })
-}
-
-fn middle(polygon: &[nalgebra::Vector2<f64>]) -> nalgebra::Vector2<f64> {
-    polygon.iter().sum::<nalgebra::Vector2<f64>>() / polygon.len().max(1) as f64
 }
 
 /// Joints between the root link and the soles, by name.
@@ -127,14 +134,18 @@ impl<'a> Problem<'a> {
         let joints = || standing.joint_names.iter().zip(&standing.limits);
         let ranges: Vec<(f64, f64)> = joints().map(|(_, limits)| kept(limits, LEG_MARGIN)).collect();
         let rather = joints().map(|(name, limits)| {
-            let margin = if is_leg(name) { LEG_MARGIN } else { OTHER_MARGIN };
-            let (lower, upper) = kept(limits, margin);
-            0.0_f64.clamp(lower, upper)
+            let (lower, upper) = kept(limits, if is_leg(name) { LEG_MARGIN } else { OTHER_MARGIN });
+            // A knee: it bends to one side only, and a straight one does not know where to go.
+            let bends = is_leg(name) && lower.max(-upper) > -ONE_SIDED;
+            let bent = if lower + upper > 0.0 { KNEE } else { -KNEE };
+            if bends { bent } else { 0.0_f64 }.clamp(lower, upper)
         });
         let mut problem = Self {
             standing,
             root,
+            middle: standing.sole(sole).map_or_else(Vector2::zeros, |sole| centroid(&sole.polygon)),
             height: 0.0,
+            upright: Matrix3::identity(),
             swing: None,
             lower: DVector::from_iterator(ranges.len(), ranges.iter().map(|range| range.0)),
             upper: DVector::from_iterator(ranges.len(), ranges.iter().map(|range| range.1)),
@@ -145,6 +156,7 @@ impl<'a> Problem<'a> {
         let zeros = DVector::zeros(ranges.len());
         let (_, base) = problem.stands(&zeros);
         problem.height = BENT * base.translation.z;
+        problem.upright = base.rotation;
         let other = robot.soles.iter().find(|other| other.name != sole);
         problem.swing = other.map(|other| {
             let place = problem.pose(&other.frame).translation;
@@ -171,18 +183,22 @@ impl<'a> Problem<'a> {
 
     fn residual(&mut self, q: &DVector<f64>) -> DVector<f64> {
         let (com, base) = self.stands(q);
-        let mut values = vec![COM * com.x, COM * com.y, HEIGHT * (base.translation.z - self.height)];
-        values.extend(lean(&base).map(|angle| UPRIGHT * angle));
+        let mut values = vec![
+            COM * (com.x - self.middle.x),
+            COM * (com.y - self.middle.y),
+            HEIGHT * (base.translation.z - self.height),
+        ];
+        values.extend(lean(&(base.rotation * self.upright.transpose())).map(|angle| UPRIGHT * angle));
         if let Some((frame, place)) = &self.swing {
             let foot = self.pose(frame);
             values.extend((foot.translation - place).iter().map(|x| SWING * x));
-            values.extend(lean(&foot).map(|angle| SWING_TURN * angle));
+            values.extend(lean(&foot.rotation).map(|angle| SWING_TURN * angle));
         }
         values.extend((q - &self.rather).iter().map(|x| STAY * x));
         DVector::from_vec(values)
     }
 
-    /// Gauss-Newton with steps of bounded length, clipped to the ranges.
+    /// Gauss-Newton with steps of bounded length, in the ranges: joints that would leave them are held for the step.
     fn solve(&mut self) -> DVector<f64> {
         let joints = self.rather.len();
         let mut q = self.rather.clone();
@@ -195,7 +211,16 @@ impl<'a> Problem<'a> {
                 moved[joint] += H;
                 jacobian.set_column(joint, &((self.residual(&moved) - &residual) / H));
             }
-            let normal = jacobian.tr_mul(&jacobian) + DMatrix::identity(joints, joints) * 1e-3;
+            let gradient = jacobian.tr_mul(&residual);
+            // A joint at a stop that it would leave its range by stays there.
+            for joint in 0..joints {
+                let held = (q[joint] <= self.lower[joint] && gradient[joint] > 0.0)
+                    || (q[joint] >= self.upper[joint] && gradient[joint] < 0.0);
+                if held {
+                    jacobian.column_mut(joint).fill(0.0);
+                }
+            }
+            let normal = jacobian.tr_mul(&jacobian) + DMatrix::identity(joints, joints) * DAMPING;
             let Some(factor) = normal.cholesky() else { break };
             let mut step = -factor.solve(&jacobian.tr_mul(&residual));
             let longest = step.amax();
@@ -214,7 +239,6 @@ impl<'a> Problem<'a> {
 }
 
 /// Half the skew part of a rotation: small angles about x, y, z.
-fn lean(pose: &RigidTransform) -> [f64; 3] {
-    let r = &pose.rotation;
+fn lean(r: &Matrix3<f64>) -> [f64; 3] {
     [(r[(2, 1)] - r[(1, 2)]) / 2.0, (r[(0, 2)] - r[(2, 0)]) / 2.0, (r[(1, 0)] - r[(0, 1)]) / 2.0]
 }
