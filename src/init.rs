@@ -130,7 +130,6 @@ fn make(urdf: &Path, text: &str, stand: Stand) -> Result<Made, Failure> {
     let robot = load(&table)?;
     table.feet = find_feet(&robot).map_err(|why| named(why.to_string()))?;
     lock_most(&robot, &mut table);
-    let robot = load(&table)?;
     let sole = stance(&table.feet, stand)
         .ok_or_else(|| {
             let found: Vec<&str> = table.feet.iter().map(|foot| foot.link.as_str()).collect();

@@ -234,15 +234,10 @@ pub struct Size {
     pub height: f64,
     /// Distances of the mass centre from the front and from the outer edge of the sole, m.
     pub to_edge: [f64; 2],
-    /// Mean distance of the sole's corners from its middle, m.
-    pub corner: f64,
-    /// Median effort of the legs' joints over weight times height.
-    pub effort: f64,
 }
 
 /// The robot whose weights are the defaults: Atlas.
 const REFERENCE_HEIGHT_M: f64 = 1.0;
-const REFERENCE_EFFORT: f64 = 0.25;
 const REFERENCE_WEIGHT_N: f64 = 1717.0;
 
 impl Size {
@@ -254,19 +249,8 @@ impl Size {
             let along = polygon.iter().map(|corner| corner.x * direction[0] + corner.y * direction[1]);
             along.fold(0.0, f64::max)
         };
-        let corner = polygon.iter().map(|corner| corner.norm()).sum::<f64>() / polygon.len().max(1) as f64;
-        let legs = leg_joints(robot);
-        let weight = mass * robot.tree.gravity_w().norm();
-        let mut efforts: Vec<f64> = legs
-            .iter()
-            .filter_map(|name| Some(robot.limits[robot.joint(name)?].effort))
-            .filter(|effort| effort.is_finite())
-            .map(|effort| effort / (weight * standing.com.z))
-            .collect();
-        efforts.sort_by(f64::total_cmp);
-        let effort = efforts.get(efforts.len() / 2).copied().unwrap_or(REFERENCE_EFFORT);
         let to_edge = [reach([1.0, 0.0]), reach([0.0, 1.0]).min(reach([0.0, -1.0]))];
-        Self { mass, height: standing.com.z, to_edge, corner, effort }
+        Self { mass, height: standing.com.z, to_edge }
     }
 
     /// What an inverted pendulum on the sole survives at most when pushed forward, N s.
@@ -314,29 +298,29 @@ pub fn scenario_text(
     );
     let com = round(2000.0 * scale * scale);
     let com_velocity = round(200.0 * scale);
-    let torque = round((500.0 * (size.effort / REFERENCE_EFFORT).powi(2)).clamp(1.0, 1e5));
     let _ = write!(
         text,
-        "\n# Weights: one over the square of what counts 1. Lengths are those of its height ({:.2} m to the mass centre), torques those of\n\
-         # its weight ({weight:.0} N).\n\
+        "\n# Weights: one over the square of what counts 1. Lengths go with its height: {:.2} m to the mass centre.\n\
          [controller.weights]\n\
          com_per_m2 = [{com:?}, {com:?}, 0.0]\n\
          com_velocity_s2_per_m2 = [{com_velocity:?}, {com_velocity:?}, 0.0]\n\
          joint_speed_s2_per_rad2 = {:?}\n\
-         torque_per_limit2 = {torque:?}\n\
+         torque_per_limit2 = 100.0\n\
+         posture_per_rad2 = {:?}\n\
          hand_per_m2 = {:?}\n\
          swing_foot_per_m2 = [0.0, 0.0, {:?}]\n",
         size.height,
         round(0.5 / scale),
+        round(20.0 * scale * scale),
         round(10_000.0 * scale * scale),
         round(1000.0 * scale * scale),
     );
     let _ = write!(
         text,
         "\n[controller.constraints]\n\
-         yaw_arm_m = {:?}               # yaw torque per vertical force that the sole bears by friction\n\
+         yaw_arm_m = {:?}               # yaw torque per vertical force that the sole bears by friction, on its narrow side\n\
          cop_margin_m = {:?}            # distance that the plan keeps from the edge of the sole\n",
-        round(0.6 * 0.7 * size.corner),
+        round(0.6 * 0.9 * size.to_edge[1]),
         round((0.003_f64).min(0.05 * size.to_edge[1])),
     );
     if let Some((hand, at)) = ball {
