@@ -106,6 +106,7 @@ Examples:
   delmpc model configs/robots/atlas.urdf
   delmpc model configs/robots/atlas.urdf --svg atlas.svg
   delmpc model configs/robots/atlas.urdf --base fixed:r_foot
+  delmpc model configs/robots/atlas.urdf --stand left       a posture on the left sole
   echo '{\"q\": {\"r_leg_kny\": 0.9}, \"dt\": 0.005}' > at.json
   delmpc model configs/robots/atlas.urdf --at at.json       A, B, mass matrix, step as JSON";
 

@@ -19,6 +19,7 @@ use delmpc_robots::{
     Companion, ImpossibleInertia, LoadOptions, RobotError, RobotModel, Rule, load_str, load_with,
 };
 
+use crate::check::weightless_joints;
 use crate::init::feet::{FoundFoot, find_feet};
 use crate::init::files::{Size, Table, scenario_text};
 use crate::output::{line, say};
@@ -166,6 +167,7 @@ fn load_bare(urdf: &Path, table: &mut Table) -> Result<RobotModel, Failure> {
 
 /// Locks what no motor drives: followers, joints without torque, speed or range.
 fn lock_joints(robot: &RobotModel, table: &mut Table) {
+    let weightless: Vec<usize> = weightless_joints(robot).into_iter().map(|(joint, _)| joint).collect();
     for (joint, name) in robot.joint_names.iter().enumerate() {
         let limits = &robot.limits[joint];
         let why = if !robot.actuated[joint] {
@@ -176,6 +178,8 @@ fn lock_joints(robot: &RobotModel, table: &mut Table) {
             "its velocity is 0"
         } else if limits.lower >= limits.upper {
             "it has no range"
+        } else if weightless.contains(&joint) {
+            "it turns no inertia"
         } else {
             continue;
         };

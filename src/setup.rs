@@ -70,7 +70,8 @@ impl Setup {
             }
         };
         findings.warnings.extend(robot.warnings.iter().cloned());
-        let clamped = crate::check::clamp_efforts(&mut robot);
+        let mut clamped = crate::check::clamp_efforts(&mut robot);
+        clamped.extend(crate::stance::weightless(&robot));
         findings.warnings.extend(clamped.into_iter().map(|warning| format!("{}: {warning}", urdf.display())));
         let setup = Self { scenario, robot, urdf, notes: document.notes().to_vec() };
         let of_file = |fault: String| format!("{}: {fault}", file.display());

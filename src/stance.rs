@@ -49,6 +49,7 @@ pub fn stances(robot: &RobotModel) -> Result<(String, Vec<String>), ModelError> 
     }
     let (mut text, mut warnings) = (String::new(), undriven(robot));
     warnings.extend(crate::check::clamp_efforts(&mut robot.clone()));
+    warnings.extend(weightless(robot));
     if robot.soles.is_empty() || robot.postures.is_empty() {
         let table = robot.file.with_extension("toml");
         let missing = if robot.soles.is_empty() { "sole" } else { "posture" };
@@ -198,6 +199,18 @@ pub fn undriven(robot: &RobotModel) -> Vec<String> {
         }
     });
     why.collect()
+}
+
+/// Joints that turn next to nothing, in words.
+pub fn weightless(robot: &RobotModel) -> Vec<String> {
+    let in_words = |(joint, inertia): (usize, f64)| {
+        let name = &robot.joint_names[joint];
+        format!(
+            "joint `{name}` turns an inertia of {inertia:.1e} kg m² only, so nothing can be computed of its motion: give its link an inertia, \
+             or lock it in the companion table, [locked] {name} = 0.0"
+        )
+    };
+    crate::check::weightless_joints(robot).into_iter().map(in_words).collect()
 }
 
 struct Holding {

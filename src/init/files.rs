@@ -68,22 +68,28 @@ impl Table {
             );
         }
         if let Some((standing, joints)) = &self.posture {
-            let rotation = Rotation3::from_matrix_unchecked(standing.base_link.rotation);
-            let (roll, pitch, yaw) = rotation.euler_angles();
-            let _ = write!(
-                text,
-                "\n# Where it stands at rest: the root link in a world whose origin is the middle of the sole, x forward, z up. The mass centre\n\
-                 # is over the middle of the sole. Solved by inverse kinematics; joints that are not named are at 0.\n\
-                 [[posture]]\nname = \"stand\"\nbase_position_m = {}\nbase_rpy_rad = {}\n[posture.joints]\n",
-                exact(standing.base_link.translation.iter()),
-                exact([roll, pitch, yaw].iter())
-            );
-            for (name, value) in joints.iter().zip(&standing.q).filter(|(_, value)| **value != 0.0) {
-                let _ = writeln!(text, "{} = {value:?}", quoted(name));
-            }
+            text.push_str(&posture_text("stand", standing, joints));
         }
         text
     }
+}
+
+/// A posture as an entry of a companion table.
+pub fn posture_text(name: &str, standing: &Standing, joints: &[String]) -> String {
+    let rotation = Rotation3::from_matrix_unchecked(standing.base_link.rotation);
+    let (roll, pitch, yaw) = rotation.euler_angles();
+    let mut text = format!(
+        "\n# Where it stands at rest: the root link in a world whose origin is the middle of the sole, x forward, z up. The mass centre\n\
+         # is over the middle of the sole. Solved by inverse kinematics; joints that are not named are at 0.\n\
+         [[posture]]\nname = {}\nbase_position_m = {}\nbase_rpy_rad = {}\n[posture.joints]\n",
+        quoted(name),
+        exact(standing.base_link.translation.iter()),
+        exact([roll, pitch, yaw].iter())
+    );
+    for (name, value) in joints.iter().zip(&standing.q).filter(|(_, value)| **value != 0.0) {
+        let _ = writeln!(text, "{} = {value:?}", quoted(name));
+    }
+    text
 }
 
 fn foot_text(text: &mut String, foot: &FoundFoot) {
@@ -113,24 +119,20 @@ fn foot_text(text: &mut String, foot: &FoundFoot) {
     );
 }
 
-fn quoted(name: &str) -> String {
-    toml_string(name)
-}
-
 /// A text as TOML writes it.
-fn toml_string(text: &str) -> String {
-    let mut quoted = String::from("\"");
+fn quoted(text: &str) -> String {
+    let mut out = String::from("\"");
     for c in text.chars() {
         match c {
-            '"' | '\\' => quoted.extend(['\\', c]),
+            '"' | '\\' => out.extend(['\\', c]),
             c if c.is_control() => {
-                let _ = write!(quoted, "\\u{:04X}", u32::from(c));
+                let _ = write!(out, "\\u{:04X}", u32::from(c));
             }
-            c => quoted.push(c),
+            c => out.push(c),
         }
     }
-    quoted.push('"');
-    quoted
+    out.push('"');
+    out
 }
 
 fn exact<'a>(values: impl Iterator<Item = &'a f64>) -> String {
@@ -285,7 +287,7 @@ pub fn scenario_text(
          posture = \"stand\"             # posture of the companion table that it begins and rests in\n",
         robot.name,
         if ball.is_some() { ", fetches a ball" } else { "" },
-        toml_string(&format!("{stem}.urdf")),
+        quoted(&format!("{stem}.urdf")),
     );
     let noise = weight / REFERENCE_WEIGHT_N;
     let _ = write!(
@@ -338,7 +340,7 @@ pub fn scenario_text(
         "\n# Half of what an inverted pendulum on this sole survives when pushed forward, on the root link.\n\
          [push]\nlink = {}\ndirection = [1.0, 0.0, 0.0]     # in the frame of the sole: x forward, y left, z up\n\
          impulse_ns = {:?}\nstart_s = 5.0\nduration_s = 0.1\n",
-        toml_string(robot.body_names.first().map_or("", String::as_str)),
+        quoted(robot.body_names.first().map_or("", String::as_str)),
         round(0.5 * size.capture_limit_forward()),
     );
     text
