@@ -94,8 +94,11 @@ pub fn posture_text(name: &str, standing: &Standing, joints: &[String]) -> Strin
 
 fn foot_text(text: &mut String, foot: &FoundFoot) {
     let FoundFoot { name, link, frame, corners, from } = foot;
-    let _ =
-        write!(text, "\n# Sole `{name}`, found in the {from} of {link}: points that touch the ground ...\n");
+    let _ = write!(
+        text,
+        "\n# Sole `{name}`, found in the {from} of {}: points that touch the ground ...\n",
+        in_comment(link)
+    );
     for (index, corner) in corners.iter().enumerate() {
         let at = frame.transform_point(&Vector3::new(corner.x, corner.y, 0.0));
         let _ = write!(
@@ -269,79 +272,110 @@ pub fn scenario_text(
     size: &Size,
     ball: Option<(&str, [f64; 3])>,
 ) -> String {
-    let scale = REFERENCE_HEIGHT_M / size.height;
-    let weight = size.mass * 9.81;
-    let round = |value: f64| {
-        // Three digits are enough for anybody who changes them.
-        let unit = 10_f64.powf(2.0 - value.abs().max(1e-12).log10().floor());
-        (value * unit).round() / unit
-    };
+    let fetches = if ball.is_some() { ", fetches a ball" } else { "" };
     let mut text = format!(
-        "# {} stands on its sole `{sole}`{}, takes a push, and stays up. Written by `delmpc init`; change it as you like.\n\
-         # A key that is not here has a default: `delmpc run` leaves all of them in scenario.toml of the run's folder.\n\
-         seed = 1                       # of everything random\n\
-         duration_s = 8.0\n\n\
-         [robot]\n\
-         urdf = {}\n\
-         stance = \"{sole}\"              # sole of the companion table that it stands on\n\
-         posture = \"stand\"             # posture of the companion table that it begins and rests in\n",
-        robot.name,
-        if ball.is_some() { ", fetches a ball" } else { "" },
-        quoted(&format!("{stem}.urdf")),
+        "# {} stands on its sole `{sole}`{fetches}, takes a push, and stays up. Written by `delmpc init`; change it as you like.\n\
+         # A key that is not here has a default: `delmpc run` leaves all of them in scenario.toml of the run's folder.\n",
+        in_comment(&robot.name)
     );
-    let noise = weight / REFERENCE_WEIGHT_N;
-    let _ = write!(
-        text,
-        "\n[sensors]\n\
-         foot_force_noise_n = {:?}      # in proportion to its weight\n\
-         foot_torque_noise_nm = {:?}\n",
-        round(2.0 * noise),
-        round(0.2 * noise * size.height / REFERENCE_HEIGHT_M),
-    );
-    let com = round(2000.0 * scale * scale);
-    let com_velocity = round(200.0 * scale);
-    let _ = write!(
-        text,
-        "\n# Weights: one over the square of what counts 1. Lengths go with its height: {:.2} m to the mass centre.\n\
-         [controller.weights]\n\
-         com_per_m2 = [{com:?}, {com:?}, 0.0]\n\
-         com_velocity_s2_per_m2 = [{com_velocity:?}, {com_velocity:?}, 0.0]\n\
-         joint_speed_s2_per_rad2 = {:?}\n\
-         torque_per_limit2 = 100.0\n\
-         posture_per_rad2 = {:?}\n\
-         hand_per_m2 = {:?}\n\
-         swing_foot_per_m2 = [0.0, 0.0, {:?}]\n",
-        size.height,
-        round(0.5 / scale),
-        round(20.0 * scale * scale),
-        round(10_000.0 * scale * scale),
-        round(1000.0 * scale * scale),
-    );
-    let _ = write!(
-        text,
-        "\n[controller.constraints]\n\
-         yaw_arm_m = {:?}               # yaw torque per vertical force that the sole bears by friction, on its narrow side\n\
-         cop_margin_m = {:?}            # distance that the plan keeps from the edge of the sole\n",
-        round(0.6 * 0.9 * size.to_edge[1]),
-        round((0.003_f64).min(0.05 * size.to_edge[1])),
-    );
+    let quoted_sole = quoted(sole);
+    let urdf = quoted(&format!("{stem}.urdf"));
+    keys(&mut text, "", &[("seed", "1", "of everything random"), ("duration_s", "8.0", "of the run, s")]);
+    let keys_of_robot = [
+        ("urdf", urdf.as_str(), "its companion table lies beside it"),
+        ("stance", quoted_sole.as_str(), "sole of that table that it stands on"),
+        ("posture", "\"stand\"", "posture of that table that it begins and rests in"),
+    ];
+    keys(&mut text, "robot", &keys_of_robot);
+    scaled(&mut text, size);
     if let Some((hand, at)) = ball {
-        let at = list(at.iter());
-        let _ = write!(
-            text,
-            "\n# A ball 10 cm from where the hand rests, in the frame of the sole.\n\
-             [reach]\nhand = \"{hand}\"\nball_m = {at}\nstart_s = 1.0                  # when the motion begins\n\
-             deadline_s = 1.5               # how long it may take\nhold_s = 0.8                   # how long the hand stays\n\
-             return_s = 1.2                 # how long the way back takes\n",
-        );
+        let (hand, at) = (quoted(hand), list(at.iter()));
+        text.push_str("\n# A ball 10 cm from where the hand rests.");
+        let keys_of_reach = [
+            ("hand", hand.as_str(), "frame of the companion table, or link"),
+            ("ball_m", at.as_str(), "in the frame of the sole: x forward, y left, z up"),
+            ("start_s", "1.0", "when the motion begins"),
+            ("deadline_s", "1.5", "how long it may take"),
+            ("hold_s", "0.8", "how long the hand stays"),
+            ("return_s", "1.2", "how long the way back takes"),
+        ];
+        keys(&mut text, "reach", &keys_of_reach);
     }
+    text.push_str("\n# Half of what an inverted pendulum on this sole survives when it is pushed forward.");
+    let link = quoted(robot.body_names.first().map_or("", String::as_str));
+    let impulse = three_digits(0.5 * size.capture_limit_forward());
+    let keys_of_push = [
+        ("link", link.as_str(), "pushed at its mass centre"),
+        ("direction", "[1.0, 0.0, 0.0]", "in the frame of the sole"),
+        ("impulse_ns", impulse.as_str(), "force times duration, N s"),
+        ("start_s", "5.0", "when it begins"),
+        ("duration_s", "0.1", "how long it lasts"),
+    ];
+    keys(&mut text, "push", &keys_of_push);
+    text
+}
+
+/// Sensor noise, weights and constraints of its size.
+fn scaled(text: &mut String, size: &Size) {
+    let scale = REFERENCE_HEIGHT_M / size.height;
+    let noise = size.mass * 9.81 / REFERENCE_WEIGHT_N;
+    let force = three_digits(2.0 * noise);
+    let torque = three_digits(0.2 * noise / scale);
+    let keys_of_sensors = [
+        ("foot_force_noise_n", force.as_str(), "standard deviation, in proportion to its weight"),
+        ("foot_torque_noise_nm", torque.as_str(), "the same times its height"),
+    ];
+    keys(text, "sensors", &keys_of_sensors);
+    let all_axes = |value: f64| format!("[{0}, {0}, 0.0]", three_digits(value));
+    let com = all_axes(2000.0 * scale * scale);
+    let com_velocity = all_axes(200.0 * scale);
+    let speed = three_digits(0.5 / scale);
+    let posture = three_digits(20.0 * scale * scale);
+    let hand = three_digits(10_000.0 * scale * scale);
+    let foot = format!("[0.0, 0.0, {}]", three_digits(1000.0 * scale * scale));
     let _ = write!(
         text,
-        "\n# Half of what an inverted pendulum on this sole survives when pushed forward, on the root link.\n\
-         [push]\nlink = {}\ndirection = [1.0, 0.0, 0.0]     # in the frame of the sole: x forward, y left, z up\n\
-         impulse_ns = {:?}\nstart_s = 5.0\nduration_s = 0.1\n",
-        quoted(robot.body_names.first().map_or("", String::as_str)),
-        round(0.5 * size.capture_limit_forward()),
+        "\n# Weights: one over the square of what counts 1. Lengths go with its height, {:.2} m to the mass centre.",
+        size.height
     );
-    text
+    let keys_of_weights = [
+        ("com_per_m2", com.as_str(), "mass centre away from its place, x, y, z"),
+        ("com_velocity_s2_per_m2", com_velocity.as_str(), "its velocity"),
+        ("posture_per_rad2", posture.as_str(), "every joint away from the posture"),
+        ("joint_speed_s2_per_rad2", speed.as_str(), "every joint's speed"),
+        ("torque_per_limit2", "100.0", "every joint's torque beside what gravity asks, over its limit"),
+        ("hand_per_m2", hand.as_str(), "hand away from its way to the ball"),
+        ("swing_foot_per_m2", foot.as_str(), "the other foot away from where it hangs, x, y, z"),
+    ];
+    keys(text, "controller.weights", &keys_of_weights);
+    let yaw_arm = three_digits(0.6 * 0.9 * size.to_edge[1]);
+    let margin = three_digits((0.003_f64).min(0.05 * size.to_edge[1]));
+    let keys_of_constraints = [
+        ("yaw_arm_m", yaw_arm.as_str(), "yaw torque that the sole bears by friction, per vertical force"),
+        ("cop_margin_m", margin.as_str(), "distance that the plan keeps from the edge of the sole"),
+    ];
+    keys(text, "controller.constraints", &keys_of_constraints);
+}
+
+/// A section: keys, values, and what they are.
+fn keys(text: &mut String, section: &str, keys: &[(&str, &str, &str)]) {
+    if !section.is_empty() {
+        let _ = write!(text, "\n[{section}]\n");
+    }
+    let width = keys.iter().map(|(key, value, _)| key.len() + value.chars().count()).max().unwrap_or(0);
+    for (key, value, what) in keys {
+        let gap = width - key.len() - value.chars().count();
+        let _ = writeln!(text, "{key} = {value}{:gap$}   # {what}", "");
+    }
+}
+
+/// More digits are for nobody who changes them.
+fn three_digits(value: f64) -> String {
+    let unit = 10_f64.powf(2.0 - value.abs().max(1e-12).log10().floor());
+    format!("{:?}", (value * unit).round() / unit)
+}
+
+/// A name in a comment: one line.
+fn in_comment(name: &str) -> String {
+    name.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
 }

@@ -223,16 +223,19 @@ fn bones(tree: &KinematicTree, names: &[String], bare: &[bool]) -> Vec<Shape> {
     // As thick as fits the longest bone.
     let lengths = tree.bodies().iter().skip(first).map(|body| body.joint.placement.translation.norm());
     let radius = BONE_RADIUS_M.min(0.06 * lengths.fold(0.0, f64::max)).max(1e-4);
-    let to_children = tree.bodies().iter().skip(first).filter(|body| is_bare(body.parent)).map(|body| {
+    let carried = tree.bodies().iter().skip(first).filter(|body| is_bare(body.parent));
+    let to_children = carried.filter_map(|body| {
         let along = body.joint.placement.translation;
         let length = along.norm();
         // Half a turn about x where z has no unique way to its opposite.
         let half_turn = || Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
         let rotation = Rotation3::rotation_between(&Vector3::z(), &along).unwrap_or_else(half_turn);
         let pose = RigidTransform { rotation: rotation.into_inner(), translation: along / 2.0 };
-        shape(body.parent, pose, Geometry::Capsule { radius, length })
+        (length > radius).then(|| shape(body.parent, pose, Geometry::Capsule { radius, length }))
     });
-    let bare_bodies = || (0..tree.body_count()).filter(|body| bare[*body]);
+    // The bodies inside a joint of several axes are nothing to see.
+    let bare_bodies =
+        || (0..tree.body_count()).filter(|&at| bare[at] && tree.bodies()[at].inertia.mass > 0.0);
     let at_joints = bare_bodies()
         .map(|body| shape(Some(body), RigidTransform::identity(), Geometry::Sphere { radius: 1.5 * radius }));
     let boxes = bare_bodies().filter_map(|body| {
@@ -308,4 +311,53 @@ fn drawn_shape(shape: &Shape) -> DrawnShape {
 pub fn pose(transform: &RigidTransform) -> Pose {
     let (r, t) = (&transform.rotation, &transform.translation);
     std::array::from_fn(|i| if i < 9 { r[(i / 3, i % 3)] } else { t[i - 9] })
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_box_of_an_inertia_is_the_box_it_came_from() {
+        let (mass, size) = (3.0, Vector3::new(0.1, 0.2, 0.4));
+        let moment = |a: f64, b: f64| mass * (a * a + b * b) / 12.0;
+        let moments = Vector3::new(moment(size.y, size.z), moment(size.x, size.z), moment(size.x, size.y));
+        let turn = Rotation3::from_euler_angles(0.3, -0.5, 0.9).into_inner();
+        let inertia = turn * nalgebra::Matrix3::from_diagonal(&moments) * turn.transpose();
+        let com = Vector3::new(0.0, 0.1, 0.0);
+        let (pose, found) =
+            inertia_box(&LinkInertia::new(mass, com, (inertia + inertia.transpose()) / 2.0)).unwrap();
+        let mut edges: [f64; 3] = found.into();
+        edges.sort_by(f64::total_cmp);
+        for (edge, expected) in edges.iter().zip(size.iter()) {
+            assert!((edge - expected).abs() < 1e-9, "{found}");
+        }
+        // Its longest edge lies along the turned z axis.
+        let along = pose.rotation.column(found.imax()).dot(&turn.column(2));
+        assert!((along.abs() - 1.0).abs() < 1e-9 && pose.translation == com);
+        assert_eq!(inertia_box(&LinkInertia::massless()), None);
+    }
+
+    #[test]
+    fn links_without_shapes_are_drawn_among_others_that_have_some() {
+        let body = "<inertial><mass value='1'/><inertia ixx='0.01' ixy='0' ixz='0' iyy='0.01' iyz='0' izz='0.01'/></inertial>";
+        let ball = "<visual><geometry><sphere radius='0.1'/></geometry></visual>";
+        let joint = |name: &str, parent: &str, child: &str| {
+            format!(
+                "<joint name='{name}' type='continuous'><origin xyz='0 0 0.4'/><parent link='{parent}'/><child link='{child}'/></joint>"
+            )
+        };
+        let urdf = format!(
+            "<robot name='r'><link name='a'>{body}{ball}</link><link name='b'>{body}</link><link name='c'>{body}</link>{}{}</robot>",
+            joint("j", "a", "b"),
+            joint("k", "b", "c")
+        );
+        let robot =
+            delmpc_robots::load_str("r.urdf", &urdf, None, &delmpc_robots::LoadOptions::default()).unwrap();
+        let of =
+            |body: usize| shapes(&robot).iter().filter(|shape| shape.attachment.body == Some(body)).count();
+        // The ball; bone, joint and inertia; joint and inertia.
+        assert_eq!([of(0), of(1), of(2)], [1, 3, 2]);
+    }
 }

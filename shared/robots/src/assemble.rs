@@ -357,21 +357,7 @@ impl Assembly<'_> {
                 NamedLink { name: link.name.clone(), attachment }
             })
             .collect();
-        let (mut shapes, mut meshes) = (Vec::new(), Vec::new());
-        for (link, named) in self.description.links.iter().zip(&links) {
-            for shape in &link.shapes {
-                let NamedLink { name, attachment } = named;
-                let attachment = Attachment { body: attachment.body, pose: attachment.pose * shape.pose };
-                let (role, geometry, rgba) = (shape.role, shape.geometry, shape.rgba);
-                shapes.push(Shape { link: name.clone(), attachment, role, geometry, rgba });
-            }
-            for mesh in &link.meshes {
-                let NamedLink { name, attachment } = named;
-                let attachment = Attachment { body: attachment.body, pose: attachment.pose * mesh.pose };
-                let (role, file, scale, rgba) = (mesh.role, mesh.file.clone(), mesh.scale, mesh.rgba);
-                meshes.push(Mesh { link: name.clone(), attachment, role, file, scale, rgba });
-            }
-        }
+        let (shapes, meshes) = placed_shapes(self.description, &links);
         if friction.iter().any(|&friction| friction != 0.0) {
             self.warnings.push("dry joint friction is not simulated".to_owned());
         }
@@ -519,6 +505,30 @@ fn is_repairable(error: &ModelError) -> bool {
             | ModelError::InertiaTriangle { .. }
             | ModelError::InertiaWithoutMass { .. }
     )
+}
+
+/// The shapes and meshes of every link, on the body that carries it.
+fn placed_shapes(description: &Description, links: &[NamedLink]) -> (Vec<Shape>, Vec<Mesh>) {
+    let (mut shapes, mut meshes) = (Vec::new(), Vec::new());
+    for (link, NamedLink { name, attachment }) in description.links.iter().zip(links) {
+        let at = |pose: RigidTransform| Attachment { body: attachment.body, pose: attachment.pose * pose };
+        shapes.extend(link.shapes.iter().map(|shape| Shape {
+            link: name.clone(),
+            attachment: at(shape.pose),
+            role: shape.role,
+            geometry: shape.geometry,
+            rgba: shape.rgba,
+        }));
+        meshes.extend(link.meshes.iter().map(|mesh| Mesh {
+            link: name.clone(),
+            attachment: at(mesh.pose),
+            role: mesh.role,
+            file: mesh.file.clone(),
+            scale: mesh.scale,
+            rgba: mesh.rgba,
+        }));
+    }
+    (shapes, meshes)
 }
 
 /// Warnings as lines; of many of one kind the first one, and how many there are.
