@@ -2,7 +2,7 @@
 //!
 //! | residual | scale that counts 1 |
 //! |---|---|
-//! | mass centre from the middle of the sole, x and y | 1 cm |
+//! | mass centre from the middle of the sole, x and y | 3 mm |
 //! | root link from upright (half its rotation's skew part) | 0.1 rad |
 //! | its height from a little less than that of straight legs | 5 cm |
 //! | the other sole from its place in the air | 1 cm, 0.03 rad |
@@ -18,7 +18,7 @@ use nalgebra::{DMatrix, DVector, Matrix3, Vector2, Vector3};
 
 use crate::init::feet::centroid;
 
-const COM: f64 = 100.0;
+const COM: f64 = 300.0;
 const UPRIGHT: f64 = 10.0;
 const HEIGHT: f64 = 20.0;
 const SWING: f64 = 100.0;
@@ -81,7 +81,7 @@ pub fn stand_on(robot: &RobotModel, sole: &str) -> Result<Standing, String> {
         let known = if known.is_empty() { "none".to_owned() } else { known.join(", ") };
         return Err(format!("the robot has no sole `{sole}`; it has {known}"));
     };
-    let rooted = robot.rooted_at(&stance.frame).map_err(|error| error.to_string())?;
+    let rooted = robot.rooted_at(&stance.frame).map_err(|error| error.rule().to_string())?;
     let mut problem = Problem::new(robot, &rooted.model, sole)?;
     let q = problem.solve();
     let (com, base_link) = problem.stands(&q);

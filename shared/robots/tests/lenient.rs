@@ -185,6 +185,7 @@ fn inertias_are_judged_as_they_move() {
     let model = load_str("pond/fish.urdf", &moving, Some(table), &LoadOptions::default()).unwrap();
     assert_eq!(model.tree.bodies()[1].inertia.inertia[(0, 1)], 1.0);
     assert!(model.warnings[0].contains("link `tail`") && model.warnings[0].contains("all the same"));
+    assert!(model.rooted_at("tail").is_ok() && model.rooted_at("hull").is_ok());
     // Three digits of a thin plate are round-off.
     let plate = BODY.replace("izz='0.1'", "izz='0.2003'");
     let model = warned(&fish(BODY, &plate, LIMIT, ""), 3, &["link `tail`", "round-off"]);
