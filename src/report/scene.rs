@@ -13,6 +13,8 @@ use crate::mesh_file::{self, Triangles};
 
 /// Triangles of all meshes together, so that a page stays small.
 const MOST_TRIANGLES: usize = 40_000;
+/// Mesh files of a robot that are opened.
+const MOST_MESHES: usize = 500;
 /// Largest radius of the bones of a body without shapes (m).
 const BONE_RADIUS_M: f64 = 0.02;
 
@@ -176,14 +178,15 @@ pub fn shapes(robot: &RobotModel) -> Vec<Shape> {
 pub fn drawn(robot: &RobotModel, triangles: usize) -> Drawn {
     let mut meshes: Vec<(&Mesh, Triangles)> = Vec::new();
     if triangles > 0 {
+        let named = || robot.meshes.iter().take(MOST_MESHES);
         let most = triangles / robot.meshes.len().max(1);
         let read = |mesh| Some((mesh, mesh_file::read(robot, mesh)?.simplified(most.max(12))));
-        meshes.extend(robot.meshes.iter().filter(|mesh| mesh.role == ShapeRole::Visual).filter_map(read));
+        meshes.extend(named().filter(|mesh| mesh.role == ShapeRole::Visual).filter_map(read));
         let has_visual = |link: &str| {
             let is_visual = |shape: &Shape| shape.link == link && shape.role == ShapeRole::Visual;
             robot.shapes.iter().any(is_visual) || meshes.iter().any(|(mesh, _)| mesh.link == link)
         };
-        let of_collision = robot.meshes.iter().filter(|mesh| mesh.role == ShapeRole::Collision);
+        let of_collision = named().filter(|mesh| mesh.role == ShapeRole::Collision);
         let others: Vec<(&Mesh, Triangles)> =
             of_collision.filter(|mesh| !has_visual(&mesh.link)).filter_map(read).collect();
         meshes.extend(others);

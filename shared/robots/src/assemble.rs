@@ -77,7 +77,6 @@ pub(crate) fn assemble(
         accept_unreal: false,
     };
     let floating_from_world = assembly.collect()?;
-    assembly.check_inertias()?;
     let massive_root = assembly.groups[0].inertia.mass > 0.0;
     let root = &description.links[description.root];
     // The convention of the format's users: a root link of this name is the world.
@@ -89,11 +88,18 @@ pub(crate) fn assemble(
             root.line
         ));
     }
+    let floats = match &options.base {
+        BaseChoice::Auto => (massive_root && !anchored) || floating_from_world,
+        BaseChoice::Floating => true,
+        BaseChoice::Fixed(name) => {
+            let link = description.links.iter().position(|link| link.name == *name);
+            link.and_then(|link| assembly.placed[link]).is_some_and(|(group, _)| group != 0)
+        }
+    };
+    assembly.check_inertias(usize::from(!floats))?;
     let refuse_base = |wanted: String| Err(assembly.refuse_file(Rule::Base { wanted }));
     match &options.base {
-        BaseChoice::Auto => {
-            assembly.finish(companion, (massive_root && !anchored) || floating_from_world, None)
-        }
+        BaseChoice::Auto => assembly.finish(companion, floats, None),
         BaseChoice::Floating if massive_root || floating_from_world => assembly.finish(companion, true, None),
         BaseChoice::Floating => refuse_base("floating: its root link has no mass".to_owned()),
         BaseChoice::Fixed(name) => {
@@ -201,9 +207,10 @@ impl Assembly<'_> {
         Ok(start != root)
     }
 
-    /// Every body as it moves: the links of a group together. A dummy of a milligram on a trunk does no harm, whatever its inertia says.
-    fn check_inertias(&mut self) -> Result<(), RobotError> {
-        for index in 0..self.groups.len() {
+    /// Every body that moves, from the group `first` on: the links of a group together. A dummy of a milligram on a trunk does no harm,
+    /// whatever its inertia says, nor does a pedestal.
+    fn check_inertias(&mut self, first: usize) -> Result<(), RobotError> {
+        for index in first..self.groups.len() {
             let group = &self.groups[index];
             let Some(link) = group.link else { continue };
             let given = group.given_inertia();

@@ -249,6 +249,9 @@ fn a_root_called_world_is_the_world() {
     assert!(!model.tree.is_floating());
     assert_eq!(model.link("hull").unwrap().pose.translation.z, 3.0);
     assert!(model.warnings[0].contains("fish.urdf:2: link `world`"), "{:?}", model.warnings);
+    // What does not move may have any inertia.
+    let pedestal = urdf.replacen(BODY, &impossible(1.0, 1.0), 1);
+    assert_eq!(load(&pedestal, &LoadOptions::default()).unwrap().warnings.len(), 1);
     let floating = LoadOptions { base: BaseChoice::Floating, ..LoadOptions::default() };
     assert!(load(&urdf, &floating).unwrap().tree.is_floating());
 }
