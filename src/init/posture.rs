@@ -18,7 +18,9 @@ use nalgebra::{DMatrix, DVector, Matrix3, Vector2, Vector3};
 
 use crate::init::feet::centroid;
 
+/// Of the last solution; the first one looks at the mass centre less, so that it comes near from far away.
 const COM: f64 = 300.0;
+const COM_AT_FIRST: f64 = 50.0;
 const UPRIGHT: f64 = 10.0;
 const HEIGHT: f64 = 20.0;
 const SWING: f64 = 100.0;
@@ -57,6 +59,7 @@ pub struct Standing {
 struct Problem<'a> {
     standing: &'a RobotModel,
     root: String,
+    com_weight: f64,
     /// Where the mass centre belongs, in the frame of the sole, m.
     middle: Vector2<f64>,
     /// Height of the root link over the sole, m.
@@ -83,7 +86,9 @@ pub fn stand_on(robot: &RobotModel, sole: &str) -> Result<Standing, String> {
     };
     let rooted = robot.rooted_at(&stance.frame).map_err(|error| error.rule().to_string())?;
     let mut problem = Problem::new(robot, &rooted.model, sole)?;
-    let q = problem.solve();
+    let near = problem.solve(problem.rather.clone());
+    problem.com_weight = COM;
+    let q = problem.solve(near);
     let (com, base_link) = problem.stands(&q);
     let off = (com.xy() - problem.middle).norm();
     if off > GOOD_M {
@@ -143,6 +148,7 @@ impl<'a> Problem<'a> {
         let mut problem = Self {
             standing,
             root,
+            com_weight: COM_AT_FIRST,
             middle: standing.sole(sole).map_or_else(Vector2::zeros, |sole| centroid(&sole.polygon)),
             height: 0.0,
             upright: Matrix3::identity(),
@@ -184,8 +190,8 @@ impl<'a> Problem<'a> {
     fn residual(&mut self, q: &DVector<f64>) -> DVector<f64> {
         let (com, base) = self.stands(q);
         let mut values = vec![
-            COM * (com.x - self.middle.x),
-            COM * (com.y - self.middle.y),
+            self.com_weight * (com.x - self.middle.x),
+            self.com_weight * (com.y - self.middle.y),
             HEIGHT * (base.translation.z - self.height),
         ];
         values.extend(lean(&(base.rotation * self.upright.transpose())).map(|angle| UPRIGHT * angle));
@@ -199,9 +205,8 @@ impl<'a> Problem<'a> {
     }
 
     /// Gauss-Newton with steps of bounded length, in the ranges: joints that would leave them are held for the step.
-    fn solve(&mut self) -> DVector<f64> {
-        let joints = self.rather.len();
-        let mut q = self.rather.clone();
+    fn solve(&mut self, mut q: DVector<f64>) -> DVector<f64> {
+        let joints = q.len();
         for _ in 0..MOST_STEPS {
             let residual = self.residual(&q);
             let mut jacobian = DMatrix::zeros(residual.len(), joints);
