@@ -8,7 +8,8 @@
 use std::path::{Path, PathBuf};
 
 use delmpc_mechanics::kinematics::{Configuration, Kinematics};
-use delmpc_mechanics::prelude::{JointKind, KinematicTree};
+use delmpc_mechanics::mass_matrix::{MassMatrixWorkspace, mass_matrix_into};
+use delmpc_mechanics::prelude::{JointKind, KinematicTree, RigidTransform};
 use delmpc_robots::{LoadOptions, RobotModel, load_with};
 
 use crate::output::{line, say};
@@ -167,11 +168,41 @@ pub fn clamp_efforts(robot: &mut RobotModel) -> Vec<String> {
     warnings
 }
 
+/// A joint turns next to nothing below this part of the robot's mass times the square of its size.
+const NEXT_TO_NOTHING: f64 = 1e-9;
+
+/// Joints that, with all joints at zero, turn next to no inertia, and how much, kg m²: point masses on their own axis. No motor's torque
+/// says anything of their motion.
+pub fn weightless_joints(robot: &RobotModel) -> Vec<(usize, f64)> {
+    let tree = &robot.tree;
+    let zeros = vec![0.0; tree.joint_count()];
+    let configuration = match tree.is_floating() {
+        true => Configuration::floating(RigidTransform::identity(), &zeros),
+        false => Configuration::fixed(&zeros),
+    };
+    let dof = tree.dof();
+    let mut kinematics = Kinematics::new(tree);
+    let mut matrix = vec![0.0; dof * dof];
+    let computed = kinematics
+        .update_positions(tree, &configuration)
+        .and_then(|()| mass_matrix_into(tree, &kinematics, &mut MassMatrixWorkspace::new(tree), &mut matrix));
+    if computed.is_err() {
+        return Vec::new();
+    }
+    let (torque, _) = largest_efforts(tree);
+    let weight = tree.total_mass() * tree.gravity_w().norm().max(1.0);
+    let size = torque / (PLACEHOLDER * weight);
+    let first = dof - tree.joint_count();
+    let inertia = |joint: usize| matrix[(first + joint) * (dof + 1)];
+    let light = |joint: &(usize, f64)| joint.1 < NEXT_TO_NOTHING * tree.total_mass() * size * size;
+    (0..tree.joint_count()).map(|joint| (joint, inertia(joint))).filter(light).collect()
+}
+
 /// Torque and force that no joint of the robot needs.
 fn largest_efforts(tree: &KinematicTree) -> (f64, f64) {
     let zeros = vec![0.0; tree.joint_count()];
     let configuration = match tree.is_floating() {
-        true => Configuration::floating(delmpc_mechanics::prelude::RigidTransform::identity(), &zeros),
+        true => Configuration::floating(RigidTransform::identity(), &zeros),
         false => Configuration::fixed(&zeros),
     };
     let mut kinematics = Kinematics::new(tree);

@@ -6,6 +6,7 @@ use clap::{Args, Parser, Subcommand};
 
 use crate::check::CheckArguments;
 use crate::completions::CompletionsArguments;
+use crate::init::InitArguments;
 use crate::model::ModelArguments;
 use crate::plan::PlanArguments;
 use crate::push_map::PushMapArguments;
@@ -105,8 +106,15 @@ Examples:
   delmpc model configs/robots/atlas.urdf
   delmpc model configs/robots/atlas.urdf --svg atlas.svg
   delmpc model configs/robots/atlas.urdf --base fixed:r_foot
+  delmpc model configs/robots/atlas.urdf --stand left       a posture on the left sole
   echo '{\"q\": {\"r_leg_kny\": 0.9}, \"dt\": 0.005}' > at.json
   delmpc model configs/robots/atlas.urdf --at at.json       A, B, mass matrix, step as JSON";
+
+const INIT_EXAMPLES: &str = "\
+Examples:
+  delmpc init talos.urdf                        folder talos with talos.urdf, talos.toml, stand.toml
+  delmpc init talos.urdf --stand left --out try
+  delmpc check talos/stand.toml && delmpc run talos/stand.toml";
 
 const CHECK_EXAMPLES: &str = "\
 Examples:
@@ -170,6 +178,12 @@ pub enum Command {
     /// postures, and what was accepted but should be known.
     #[command(after_long_help = MODEL_EXAMPLES)]
     Model(ModelArguments),
+    /// Make a companion table and a scenario for a robot that has none
+    ///
+    /// Soles are found from its shapes and mesh files, a posture on one sole is solved by inverse kinematics, weights, noise and push are
+    /// those of its size. Joints that cannot be driven are locked. The files say what every key means; change them as you like.
+    #[command(after_long_help = INIT_EXAMPLES)]
+    Init(InitArguments),
     /// Check scenarios, robots and companion tables: everything that `run` would refuse, all at once
     ///
     /// Keys alone and against each other, the robot, names that it must know, posture, torques, controller and plant. Exit status 2 when

@@ -12,7 +12,7 @@ use delmpc_mechanics::prelude::RigidTransform;
 use delmpc_robots::{Geometry, Posture, RobotModel};
 use nalgebra::{Vector2, Vector3};
 
-use crate::report::scene::shapes;
+use crate::report::scene::{Drawn, DrawnSurface, drawn};
 
 /// Largest edge of a piece of a box (m).
 const PIECE_M: f64 = 0.08;
@@ -28,6 +28,8 @@ const CAPTION: f64 = 34.0;
 const TITLE: f64 = 58.0;
 /// Least width of the drawing, for its title (pixels).
 const WIDTH: f64 = 380.0;
+/// Triangles of all meshes in all postures.
+const TRIANGLES: usize = 12_000;
 /// Most postures in a row.
 const COLUMNS: usize = 4;
 const DEFAULT_COLOUR: [f64; 3] = [0.42, 0.48, 0.55];
@@ -72,9 +74,10 @@ pub fn drawing(robot: &RobotModel) -> Result<String, ModelError> {
     };
     let postures = if robot.postures.is_empty() { std::slice::from_ref(&zero) } else { &robot.postures };
     let eye = Eye::new();
+    let drawn = drawn(robot, TRIANGLES / postures.len());
     let mut figures = Vec::new();
     for posture in postures {
-        let mut pieces = pieces(robot, posture)?;
+        let mut pieces = pieces(robot, &drawn, posture, &eye)?;
         pieces.retain(|piece| piece.normal.dot(&eye.back) > 0.0);
         let depth = |piece: &Piece| {
             piece.corners.iter().sum::<Vector3<f64>>().dot(&eye.back) / piece.corners.len() as f64
@@ -161,7 +164,7 @@ impl Bounds {
 }
 
 /// All surfaces of a posture in the world.
-fn pieces(robot: &RobotModel, posture: &Posture) -> Result<Vec<Piece>, ModelError> {
+fn pieces(robot: &RobotModel, drawn: &Drawn, posture: &Posture, eye: &Eye) -> Result<Vec<Piece>, ModelError> {
     let tree = &robot.tree;
     let mut kinematics = Kinematics::new(tree);
     let configuration = if tree.is_floating() {
@@ -172,7 +175,7 @@ fn pieces(robot: &RobotModel, posture: &Posture) -> Result<Vec<Piece>, ModelErro
     };
     kinematics.update_positions(tree, &configuration)?;
     let mut all = Vec::new();
-    for shape in shapes(robot) {
+    for shape in &drawn.shapes {
         let body = shape
             .attachment
             .body
@@ -185,6 +188,21 @@ fn pieces(robot: &RobotModel, posture: &Posture) -> Result<Vec<Piece>, ModelErro
             // A quad at a pole is a triangle; one without any area shows nothing.
             if let Some(normal) = normal.try_normalize(1e-12) {
                 all.push(Piece { corners, normal, colour });
+            }
+        }
+    }
+    for DrawnSurface { body, surface, rgba, .. } in &drawn.meshes {
+        let pose = body.map_or_else(RigidTransform::identity, |body| kinematics.link_poses_w()[body]);
+        let colour = rgba.map_or(DEFAULT_COLOUR, |[red, green, blue, _]| [red, green, blue]);
+        let points: Vec<Vector3<f64>> =
+            surface.points.iter().map(|point| pose.transform_point(point)).collect();
+        for face in &surface.faces {
+            let corners = face.map(|corner| points[corner]);
+            let normal = (corners[1] - corners[0]).cross(&(corners[2] - corners[0]));
+            // Files do not agree on which side is outside: both are shown.
+            let towards = if normal.dot(&eye.back) < 0.0 { -normal } else { normal };
+            if let Some(normal) = towards.try_normalize(1e-12) {
+                all.push(Piece { corners: corners.to_vec(), normal, colour });
             }
         }
     }

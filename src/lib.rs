@@ -22,6 +22,8 @@
 //! | [`colour`] | colours on a terminal |
 //! | [`stance`] | how a robot stands in its postures, for the table of `delmpc model` |
 //! | [`check`] | everything that a run would refuse, all at once |
+//! | [`mod@init`] | companion table and scenario of a robot that has none |
+//! | [`mesh_file`] | mesh files of a robot, found and read |
 //! | [`drawing`] | a robot in its postures as SVG |
 //! | [`completions`] | what a shell needs to complete our words |
 //! | [`log`], [`log_viewer`] | the log of states, commands and truth, and what shows the robot to viewers of logs |
@@ -41,6 +43,7 @@ pub mod completions;
 pub mod controller;
 pub mod drawing;
 pub mod faults;
+pub mod init;
 pub mod input_file;
 pub mod legged_metrics;
 pub mod legged_robot;
@@ -51,6 +54,7 @@ pub mod log_queue;
 pub mod log_reader;
 mod log_schema;
 pub mod log_viewer;
+pub mod mesh_file;
 pub mod metrics;
 pub mod model;
 pub mod observer;

@@ -18,6 +18,8 @@ use nalgebra::{DMatrix, DVector, Quaternion, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::drawing::drawing;
+use crate::init::files::posture_text;
+use crate::init::posture::stand_on;
 use crate::input_file::read_answerable;
 use crate::output::{line, name_in_table, print, printable};
 use crate::stance::stances;
@@ -43,6 +45,9 @@ pub struct ModelArguments {
     /// Refuse what is read with a warning: decoration that cannot be read, values that are missing
     #[arg(long)]
     pub strict: bool,
+    /// Solve for a posture on that sole of the companion table and print it as TOML, to be added there
+    #[arg(long, value_name = "SOLE", conflicts_with_all = ["at", "svg"])]
+    pub stand: Option<String>,
     /// Draw the robot in its postures
     #[arg(long, value_name = "FILE.svg", conflicts_with = "at")]
     pub svg: Option<PathBuf>,
@@ -67,6 +72,15 @@ pub fn model(arguments: &ModelArguments) -> Result<Ended, Failure> {
         }
         None => {
             let robot = load_robot(arguments, arguments.base.as_deref(), None)?;
+            if let Some(sole) = &arguments.stand {
+                let standing = stand_on(&robot, sole)
+                    .map_err(|error| Failure::Input(format!("{}: {error}", arguments.urdf.display())))?;
+                let taken = |name: &String| robot.posture(name).is_some();
+                let names = (1..).map(|n| if n == 1 { "stand".to_owned() } else { format!("stand_{n}") });
+                let name = names.take(100).find(|name| !taken(name)).unwrap_or_default();
+                print(&posture_text(&name, &standing, &robot.joint_names))?;
+                return Ok(Ended::Well);
+            }
             print(&printable(&table(&robot)?))?;
             if let Some(file) = &arguments.svg {
                 let svg = drawing(&robot).map_err(Failure::input)?;

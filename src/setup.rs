@@ -70,7 +70,8 @@ impl Setup {
             }
         };
         findings.warnings.extend(robot.warnings.iter().cloned());
-        let clamped = crate::check::clamp_efforts(&mut robot);
+        let mut clamped = crate::check::clamp_efforts(&mut robot);
+        clamped.extend(crate::stance::weightless(&robot));
         findings.warnings.extend(clamped.into_iter().map(|warning| format!("{}: {warning}", urdf.display())));
         let mut setup = Self { scenario, robot, urdf, notes: document.notes().to_vec() };
         setup.name_all_soles();
@@ -206,15 +207,6 @@ impl Setup {
             ));
         }
         wrong.extend(crate::stance::undriven(robot).into_iter().map(|why| format!("`robot.urdf`: {why}")));
-        for (limit, joint) in robot.limits.iter().zip(&robot.joint_names) {
-            if limit.lower >= limit.upper {
-                wrong.push(format!(
-                    "`robot.urdf`: the joint {joint} has no range ({} .. {}): make its type \"fixed\", or lock it in the companion \
-                     table, [locked] {joint} = {:?}",
-                    limit.lower, limit.upper, limit.lower
-                ));
-            }
-        }
         let mut one_of = |key: &str, kind: &str, name: &str, known: Vec<&str>| {
             if !known.contains(&name) {
                 let known = known.join(", ");

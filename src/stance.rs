@@ -48,6 +48,8 @@ pub fn stances(robot: &RobotModel) -> Result<(String, Vec<String>), ModelError> 
         return Ok((String::new(), Vec::new()));
     }
     let (mut text, mut warnings) = (String::new(), undriven(robot));
+    warnings.extend(crate::check::clamp_efforts(&mut robot.clone()));
+    warnings.extend(weightless(robot));
     if robot.soles.is_empty() || robot.postures.is_empty() {
         let table = robot.file.with_extension("toml");
         let missing = if robot.soles.is_empty() { "sole" } else { "posture" };
@@ -203,11 +205,29 @@ pub fn undriven(robot: &RobotModel) -> Vec<String> {
             Some(format!(
                 "joint `{name}` has velocity 0, so it cannot move: give its <limit> the largest there is"
             ))
+        } else if limit.lower >= limit.upper {
+            Some(format!(
+                "the joint {name} has no range ({} .. {}): make its type \"fixed\", or lock it in the companion table, [locked] {name} = \
+                 {:?}",
+                limit.lower, limit.upper, limit.lower
+            ))
         } else {
             None
         }
     });
     why.collect()
+}
+
+/// Joints that turn next to nothing, in words.
+pub fn weightless(robot: &RobotModel) -> Vec<String> {
+    let in_words = |(joint, inertia): (usize, f64)| {
+        let name = &robot.joint_names[joint];
+        format!(
+            "joint `{name}` turns an inertia of {inertia:.1e} kg m² only, so nothing can be computed of its motion: give its link an inertia, \
+             or lock it in the companion table, [locked] {name} = 0.0"
+        )
+    };
+    crate::check::weightless_joints(robot).into_iter().map(in_words).collect()
 }
 
 struct Holding {

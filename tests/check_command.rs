@@ -102,6 +102,27 @@ fn locking_a_joint_is_a_remedy() {
 }
 
 #[test]
+fn an_impossible_inertia_can_be_accepted_for_every_command() {
+    let urdf = std::fs::read_to_string(Path::new(ROOT).join("configs/examples/lamp/lamp.urdf")).unwrap();
+    // The last link's, made a needle that is longer than it is thick in all directions.
+    let last = urdf.rfind("ixx=\"").unwrap();
+    let inertia = &urdf[last..last + urdf[last..].find(' ').unwrap()];
+    let folder = lamp("impossible", &[("lamp.urdf", inertia, "ixx=\"0.5\"")]);
+    let (status, _, err) = delmpc(&folder, &["check", "reach.toml"]);
+    assert_eq!(status, Some(2), "{err}");
+    says(&err, 1, "error: ", &["triangle inequality", "--set robot.accept_impossible_inertia=true"]);
+    let accept = ["--set", "robot.accept_impossible_inertia=true"];
+    let (status, _, err) = delmpc(&folder, &[&["check", "reach.toml"], &accept[..]].concat());
+    assert_eq!(status, Some(0), "{err}");
+    says(&err, 1, "warning: ", &["lamp.urdf:", "used all the same"]);
+    let table = std::fs::read_to_string(folder.join("lamp.toml")).unwrap();
+    let table = table.replacen("format = 1", "format = 1\naccept_impossible_inertia = true", 1);
+    std::fs::write(folder.join("lamp.toml"), table).unwrap();
+    let (status, _, err) = delmpc(&folder, &["check", "reach.toml"]);
+    assert_eq!(status, Some(0), "{err}");
+}
+
+#[test]
 fn a_placeholder_for_an_effort_is_lowered_and_the_robot_stands() {
     let folder = lamp("effort", &[("lamp.urdf", "effort=\"20\"", "effort=\"1e6\"")]);
     let (status, _, err) = delmpc(&folder, &["check", "reach.toml"]);

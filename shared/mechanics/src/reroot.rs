@@ -79,6 +79,9 @@ impl Rerooted {
         let bodies = tree.bodies();
         let count = bodies.len();
         let mut builder = TreeBuilder::fixed_base(*tree.gravity_w());
+        if tree.accepts_unreal_inertia() {
+            builder.accept_unreal_inertia();
+        }
         let mut new_body = vec![None; count];
         let mut old_body = Vec::with_capacity(count - 1);
         let mut old_joint_body = Vec::with_capacity(count - 1);

@@ -333,6 +333,7 @@ pub struct KinematicTree {
     gravity_w: Vector3<f64>,
     bodies: Vec<Body>,
     ground_inertia_w: SpatialInertia,
+    accepts_unreal_inertia: bool,
     constants: Vec<BodyConstants>,
     /// Coordinates on the branch of every joint body, root first, itself last, one after the other.
     paths: Vec<u32>,
@@ -340,8 +341,13 @@ pub struct KinematicTree {
 }
 
 impl KinematicTree {
+    /// Whether it was built with [`TreeBuilder::accept_unreal_inertia`]: trees made from it have to be, too.
+    pub fn accepts_unreal_inertia(&self) -> bool {
+        self.accepts_unreal_inertia
+    }
+
     fn assemble(builder: TreeBuilder) -> Result<Self, ModelError> {
-        let TreeBuilder { base, gravity_w, bodies, ground_inertia_w, .. } = builder;
+        let TreeBuilder { base, gravity_w, bodies, ground_inertia_w, accept_unreal_inertia } = builder;
         let mut subtree_mass: Vec<f64> = bodies.iter().map(|b| b.inertia.mass).collect();
         for i in (1..bodies.len()).rev() {
             if let Some(parent) = bodies[i].parent {
@@ -360,6 +366,7 @@ impl KinematicTree {
             base,
             gravity_w,
             ground_inertia_w,
+            accepts_unreal_inertia: accept_unreal_inertia,
             constants,
             paths: Vec::new(),
             path_starts: vec![0],

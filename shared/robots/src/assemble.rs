@@ -77,7 +77,6 @@ pub(crate) fn assemble(
         accept_unreal: false,
     };
     let floating_from_world = assembly.collect()?;
-    assembly.check_inertias()?;
     let massive_root = assembly.groups[0].inertia.mass > 0.0;
     let root = &description.links[description.root];
     // The convention of the format's users: a root link of this name is the world.
@@ -89,11 +88,18 @@ pub(crate) fn assemble(
             root.line
         ));
     }
+    let floats = match &options.base {
+        BaseChoice::Auto => (massive_root && !anchored) || floating_from_world,
+        BaseChoice::Floating => true,
+        BaseChoice::Fixed(name) => {
+            let link = description.links.iter().position(|link| link.name == *name);
+            link.and_then(|link| assembly.placed[link]).is_some_and(|(group, _)| group != 0)
+        }
+    };
+    assembly.check_inertias(usize::from(!floats))?;
     let refuse_base = |wanted: String| Err(assembly.refuse_file(Rule::Base { wanted }));
     match &options.base {
-        BaseChoice::Auto => {
-            assembly.finish(companion, (massive_root && !anchored) || floating_from_world, None)
-        }
+        BaseChoice::Auto => assembly.finish(companion, floats, None),
         BaseChoice::Floating if massive_root || floating_from_world => assembly.finish(companion, true, None),
         BaseChoice::Floating => refuse_base("floating: its root link has no mass".to_owned()),
         BaseChoice::Fixed(name) => {
@@ -201,9 +207,10 @@ impl Assembly<'_> {
         Ok(start != root)
     }
 
-    /// Every body as it moves: the links of a group together. A dummy of a milligram on a trunk does no harm, whatever its inertia says.
-    fn check_inertias(&mut self) -> Result<(), RobotError> {
-        for index in 0..self.groups.len() {
+    /// Every body that moves, from the group `first` on: the links of a group together. A dummy of a milligram on a trunk does no harm,
+    /// whatever its inertia says, nor does a pedestal.
+    fn check_inertias(&mut self, first: usize) -> Result<(), RobotError> {
+        for index in first..self.groups.len() {
             let group = &self.groups[index];
             let Some(link) = group.link else { continue };
             let given = group.given_inertia();
@@ -357,21 +364,7 @@ impl Assembly<'_> {
                 NamedLink { name: link.name.clone(), attachment }
             })
             .collect();
-        let (mut shapes, mut meshes) = (Vec::new(), Vec::new());
-        for (link, named) in self.description.links.iter().zip(&links) {
-            for shape in &link.shapes {
-                let NamedLink { name, attachment } = named;
-                let attachment = Attachment { body: attachment.body, pose: attachment.pose * shape.pose };
-                let (role, geometry, rgba) = (shape.role, shape.geometry, shape.rgba);
-                shapes.push(Shape { link: name.clone(), attachment, role, geometry, rgba });
-            }
-            for mesh in &link.meshes {
-                let NamedLink { name, attachment } = named;
-                let attachment = Attachment { body: attachment.body, pose: attachment.pose * mesh.pose };
-                let (role, file, scale, rgba) = (mesh.role, mesh.file.clone(), mesh.scale, mesh.rgba);
-                meshes.push(Mesh { link: name.clone(), attachment, role, file, scale, rgba });
-            }
-        }
+        let (shapes, meshes) = placed_shapes(self.description, &links);
         if friction.iter().any(|&friction| friction != 0.0) {
             self.warnings.push("dry joint friction is not simulated".to_owned());
         }
@@ -389,6 +382,7 @@ impl Assembly<'_> {
             links,
             shapes,
             meshes,
+            mesh_folder: None,
             contacts: Vec::new(),
             frames: Vec::new(),
             soles: Vec::new(),
@@ -518,6 +512,30 @@ fn is_repairable(error: &ModelError) -> bool {
             | ModelError::InertiaTriangle { .. }
             | ModelError::InertiaWithoutMass { .. }
     )
+}
+
+/// The shapes and meshes of every link, on the body that carries it.
+fn placed_shapes(description: &Description, links: &[NamedLink]) -> (Vec<Shape>, Vec<Mesh>) {
+    let (mut shapes, mut meshes) = (Vec::new(), Vec::new());
+    for (link, NamedLink { name, attachment }) in description.links.iter().zip(links) {
+        let at = |pose: RigidTransform| Attachment { body: attachment.body, pose: attachment.pose * pose };
+        shapes.extend(link.shapes.iter().map(|shape| Shape {
+            link: name.clone(),
+            attachment: at(shape.pose),
+            role: shape.role,
+            geometry: shape.geometry,
+            rgba: shape.rgba,
+        }));
+        meshes.extend(link.meshes.iter().map(|mesh| Mesh {
+            link: name.clone(),
+            attachment: at(mesh.pose),
+            role: mesh.role,
+            file: mesh.file.clone(),
+            scale: mesh.scale,
+            rgba: mesh.rgba,
+        }));
+    }
+    (shapes, meshes)
 }
 
 /// Warnings as lines; of many of one kind the first one, and how many there are.

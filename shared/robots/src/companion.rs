@@ -3,6 +3,7 @@
 //! ```toml
 //! format = 1
 //! passive = ["ankle"]                       # joints without a motor
+//! mesh_folder = "../urdf"                   # where names of meshes are relative to, from here; optional: here
 //! accept_impossible_inertia = false         # take inertias that no body has, hold joints that carry no mass
 //!
 //! [locked]                                  # joints that do not move, and where they stand, rad or m
@@ -59,6 +60,7 @@ struct Tables {
     format: Spanned<u32>,
     #[serde(default)]
     passive: Vec<Spanned<String>>,
+    mesh_folder: Option<PathBuf>,
     #[serde(default)]
     accept_impossible_inertia: bool,
     #[serde(default)]
@@ -210,6 +212,8 @@ impl CompanionFile {
 
     /// Adds contacts, frames, soles and postures to a model whose links and joints are complete.
     pub(crate) fn complete(&self, model: &mut RobotModel) -> Result<(), RobotError> {
+        let here = self.path.parent().unwrap_or(Path::new(""));
+        model.mesh_folder = self.tables.mesh_folder.as_ref().map(|folder| here.join(folder));
         self.add_contacts(model)?;
         self.add_frames(model)?;
         self.add_soles(model)?;

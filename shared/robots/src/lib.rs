@@ -26,10 +26,11 @@
 //! | decoration that cannot be read | left out, with a warning ([`LoadOptions::strict`]: an error) |
 //! | root link `world` without mass | the world itself: fixed base, with a warning |
 //!
-//! Joint coordinates are numbered depth-first, branches in the order of the file. Nothing is defaulted silently: a link that
-//! moves without `<inertial>`, a revolute joint without `<limit>`, an inertia no body can have are errors that name the file,
-//! the line, the link or joint, the rule and the remedy ([`RobotError`]). Caps on size, depth and number of elements
-//! ([`limits`]) bound time and memory on hostile files.
+//! Joint coordinates are numbered depth-first, branches in the order of the file. Nothing is defaulted silently: what mechanics needs
+//! and the file does not have (a mass, the effort of a motor, a possible inertia of what moves) is an error that names the file, the
+//! line, the link or joint, the rule and the remedy ([`RobotError`]); what the field leaves out or writes beside the format is read with
+//! a warning of the same form ([`RobotModel::warnings`]). Caps on size, depth and number of elements ([`limits`]) bound time and memory
+//! on hostile files.
 //!
 //! Reading order: [`load`], [`RobotModel`], [`RootedModel`], then `document` (XML), `urdf` (description), `assemble` (tree),
 //! `companion` (TOML).

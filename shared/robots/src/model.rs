@@ -38,6 +38,8 @@ pub struct RobotModel {
     pub shapes: Vec<Shape>,
     /// Meshes, by the names of their files. They are not opened.
     pub meshes: Vec<Mesh>,
+    /// Folder that their names are relative to, where it is not that of the URDF.
+    pub mesh_folder: Option<PathBuf>,
     /// Contact points.
     pub contacts: Vec<ContactPoint>,
     /// Named frames: soles, hand points.

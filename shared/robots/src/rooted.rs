@@ -57,6 +57,7 @@ impl RobotModel {
                 .iter()
                 .map(|shape| Shape { attachment: moved(&shape.attachment), ..shape.clone() })
                 .collect(),
+            mesh_folder: self.mesh_folder.clone(),
             meshes: self
                 .meshes
                 .iter()

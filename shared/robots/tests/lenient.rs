@@ -185,6 +185,7 @@ fn inertias_are_judged_as_they_move() {
     let model = load_str("pond/fish.urdf", &moving, Some(table), &LoadOptions::default()).unwrap();
     assert_eq!(model.tree.bodies()[1].inertia.inertia[(0, 1)], 1.0);
     assert!(model.warnings[0].contains("link `tail`") && model.warnings[0].contains("all the same"));
+    assert!(model.rooted_at("tail").is_ok() && model.rooted_at("hull").is_ok());
     // Three digits of a thin plate are round-off.
     let plate = BODY.replace("izz='0.1'", "izz='0.2003'");
     let model = warned(&fish(BODY, &plate, LIMIT, ""), 3, &["link `tail`", "round-off"]);
@@ -248,6 +249,9 @@ fn a_root_called_world_is_the_world() {
     assert!(!model.tree.is_floating());
     assert_eq!(model.link("hull").unwrap().pose.translation.z, 3.0);
     assert!(model.warnings[0].contains("fish.urdf:2: link `world`"), "{:?}", model.warnings);
+    // What does not move may have any inertia.
+    let pedestal = urdf.replacen(BODY, &impossible(1.0, 1.0), 1);
+    assert_eq!(load(&pedestal, &LoadOptions::default()).unwrap().warnings.len(), 1);
     let floating = LoadOptions { base: BaseChoice::Floating, ..LoadOptions::default() };
     assert!(load(&urdf, &floating).unwrap().tree.is_floating());
 }

@@ -111,7 +111,7 @@ class Live {
       const pose = poseOf(motion.poses, shape);
       const from = movedBack(pose, optics.eye), along = movedBack([...pose.slice(0, 9), 0, 0, 0], ray);
       const [a, b, c] = shape.size;
-      const half = { box: [a / 2, b / 2, c / 2], cylinder: [a, a, b / 2], capsule: [a, a, b / 2 + a], sphere: [a, a, a] }[shape.kind];
+      const half = { box: [a / 2, b / 2, c / 2], mesh: [a / 2, b / 2, c / 2], cylinder: [a, a, b / 2], capsule: [a, a, b / 2 + a], sphere: [a, a, a] }[shape.kind];
       // Between the three pairs of faces at once.
       let enter = 0, leave = Infinity;
       for (let i = 0; i < 3; i++) {

@@ -96,4 +96,21 @@ function outlineMesh(polygon, width) {
   return meshOfQuads(polygon.map((p, i) => [p, polygon[(i + 1) % n], inset[(i + 1) % n], inset[i]].map(corner)));
 }
 
-const MESHES = { box: boxMesh, cylinder: cylinderMesh, capsule: capsuleMesh, sphere: sphereMesh };
+// Triangles of a file, flat.
+function fileMesh(size, { points, faces }) {
+  const triangles = { points: new Float32Array(3 * faces.length), normals: new Float32Array(3 * faces.length) };
+  const corner = (i) => [0, 1, 2].map((k) => points[3 * i + k] * 1e-4);
+  for (let f = 0; f < faces.length; f += 3) {
+    const [a, b, c] = [corner(faces[f]), corner(faces[f + 1]), corner(faces[f + 2])];
+    const u = b.map((x, k) => x - a[k]), v = c.map((x, k) => x - a[k]);
+    const n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+    const length = Math.hypot(...n) || 1;
+    [a, b, c].forEach((p, i) => {
+      triangles.points.set(p, 3 * (f + i));
+      triangles.normals.set(n.map((x) => x / length), 3 * (f + i));
+    });
+  }
+  return triangles;
+}
+
+const MESHES = { box: boxMesh, cylinder: cylinderMesh, capsule: capsuleMesh, sphere: sphereMesh, mesh: fileMesh };

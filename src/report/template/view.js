@@ -320,7 +320,7 @@ const signSize = (mass_kg) => Math.max(0.3, Math.min(1, Math.cbrt(mass_kg / 175)
 class Actors {
   constructor(robot) {
     this.robot = robot;
-    this.shapes = robot.shapes.map((shape) => ({ shape, mesh: MESHES[shape.kind](shape.size) }));
+    this.shapes = robot.shapes.map((shape) => ({ shape, mesh: MESHES[shape.kind](shape.size, shape) }));
     this.rod = rodMesh();
     this.cone = coneMesh();
     this.disc = discMesh();
