@@ -61,6 +61,11 @@ const GAVE_WAY: f64 = 1e-3;
 const LARGEST_MOVE: f64 = 1.0;
 /// Stances of a foot there is room for: those of a horizon, and the steps of a walk.
 const STANCES: usize = 64;
+/// Depths of a crouch that are tried, up to this part of the height of the mass centre.
+const CROUCHES: usize = 12;
+const DEEPEST_CROUCH: f64 = 0.12;
+/// An error of a foot (m, rad) counts as so much room of a joint (rad).
+const UNREACHED: f64 = 100.0;
 /// States in a row that are older than the newest one are right, and the newest one was wrong.
 const OLDER_STATES: u32 = 5;
 
@@ -124,7 +129,7 @@ pub struct LeggedConfig {
     pub limits: LeggedLimits,
     /// How a foot swings.
     pub swing: SwingShape,
-    /// By how much the robot crouches before it steps, m.
+    /// By how much the robot crouches before it steps, m; 0: by its legs.
     pub crouch_m: f64,
     /// What to do.
     pub motion: Motion,
@@ -274,39 +279,6 @@ impl LeggedController {
             near_posture: false,
             blind_s: self.last_state_ns.map_or(0.0, |last| now_s - self.run_time_s(last)),
         });
-        #[cfg(feature = "std")]
-        if std::env::var_os("LEGDBG").is_some() {
-            extern crate std;
-            let sch: u32 = (0..self.robot.model.feet.len())
-                .map(|k| u32::from(self.schedule.stands(k, now_s)) << k)
-                .sum();
-            let ld: u32 =
-                (0..self.robot.model.feet.len()).map(|k| u32::from(self.sensing.feet()[k].loaded) << k).sum();
-            let r = &self.command.report;
-            std::eprintln!(
-                "{:.3} reason {} verdict {} stance {:b} loaded {:b} retimed {:b} worst {:?} {:.3} st {} row {} active {} dropped {} qp {} com {:?} pred-target dq {:.4}",
-                now_s,
-                self.command.reason,
-                self.command.verdict,
-                sch,
-                ld,
-                self.retimed,
-                r.worst_constraint(),
-                r.worst_violation,
-                r.worst_stage,
-                r.worst_row,
-                r.active_rows,
-                r.dropped_rows,
-                r.qp_solves,
-                (self.predicted.position_w - self.reference.target(0).state.position_w).as_slice(),
-                self.predicted
-                    .q
-                    .iter()
-                    .zip(&self.reference.target(0).state.q)
-                    .map(|(a, b)| (a - b).abs())
-                    .fold(0.0, f64::max)
-            );
-        }
         self.write_command(level, state, now_ns);
         let spent_ns = clock.now_ns().saturating_sub(begin);
         self.command.report.total_ns = spent_ns;
@@ -398,16 +370,49 @@ impl LeggedController {
                     return Err(ControlError::Model { reason: "the steps do not fit one after the other" });
                 }
                 let first_s = steps.first().map_or(0.0, |step| step.lift_s);
-                (aim.crouch_m, aim.crouched_s) = (self.config.crouch_m, first_s);
+                aim.crouched_s = first_s;
                 let ground = places.iter().map(|place| place.position_w.z).sum::<f64>() / places.len() as f64;
                 let (height, gravity) = (aim.height_m - ground, model.tree.gravity_w().norm());
                 aim.mass_centre = Some(mass_centre_over(steps, &places, aim.path.origin, height, gravity));
             }
         }
         self.ground = GroundPlane::new(&places, &self.flat);
+        if matches!(self.config.motion, Motion::Steps(_)) {
+            self.crouch(measured_s)?;
+        }
         let aim = self.reference.aim();
         self.height_m = aim.height_m - self.ground.offset_m(&aim.path.origin);
         self.placed = true;
+        Ok(())
+    }
+
+    /// Lowers the mass centre by what is asked, or by what leaves the joints of the legs the most room at all lift-offs and touchdowns: high up a leg
+    /// has to stretch, low down an ankle has to bend.
+    fn crouch(&mut self, measured_s: f64) -> Result<(), ControlError> {
+        let model = &self.robot.model;
+        if self.config.crouch_m > 0.0 {
+            self.reference.aim_mut().crouch_m = self.config.crouch_m;
+            return Ok(());
+        }
+        let mut schedule = self.schedule.clone();
+        schedule.map_later(measured_s, |place| self.ground.on_ground(place));
+        let height_m = self.reference.aim().height_m;
+        let home = self.reference.target(0).state.q.clone();
+        let mut best = (f64::NEG_INFINITY, 0.0);
+        for part in 0..=CROUCHES {
+            let crouch_m = DEEPEST_CROUCH * height_m * part as f64 / CROUCHES as f64;
+            self.reference.aim_mut().crouch_m = crouch_m;
+            let mut room = f64::INFINITY;
+            for time_s in schedule.switches() {
+                let (error, margin) = self.reference.reach(model, &schedule, time_s)?;
+                room = room.min(margin - UNREACHED * error);
+            }
+            self.reference.restore_joints(&home);
+            if room > best.0 {
+                best = (room, crouch_m);
+            }
+        }
+        self.reference.aim_mut().crouch_m = best.1;
         Ok(())
     }
 

@@ -178,6 +178,19 @@ impl ContactSchedule {
         }
     }
 
+    /// Changes the places of all stances that begin after `time_s`.
+    pub fn map_later(&mut self, time_s: f64, change: impl Fn(&Foothold) -> Foothold) {
+        for stance in self.feet.iter_mut().flatten().filter(|stance| stance.begin_s > time_s) {
+            stance.place = change(&stance.place);
+        }
+    }
+
+    /// All switches, in no order, s.
+    pub fn switches(&self) -> impl Iterator<Item = f64> + '_ {
+        let times = self.feet.iter().flatten().flat_map(|stance| [stance.begin_s, stance.end_s]);
+        times.filter(|time_s| time_s.is_finite())
+    }
+
     fn stance_at(&mut self, foot: usize, time_s: f64) -> Option<&mut Stance> {
         let stances = self.feet.get_mut(foot)?;
         stances

@@ -117,7 +117,7 @@ impl GroundPlane {
     }
 
     /// A foothold that was planned on level ground.
-    fn on_ground(&self, planned: &Foothold) -> Foothold {
+    pub fn on_ground(&self, planned: &Foothold) -> Foothold {
         let mut position_w = planned.position_w;
         position_w.z += self.offset_m(&position_w.xy());
         let normal = Vector3::new(-self.gradient.x, -self.gradient.y, 1.0);

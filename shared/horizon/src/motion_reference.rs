@@ -31,6 +31,9 @@ use crate::stage_grid::StageGrid;
 const ITERATIONS: usize = 3;
 const ROUNDS: usize = 2;
 
+/// Iterations of the inverse kinematics where nothing near is known.
+const REACH_ITERATIONS: usize = 20;
+
 /// A moment, s: longer than what makes two times one.
 const BEFORE_S: f64 = 4e-6;
 
@@ -232,6 +235,11 @@ impl MotionReference {
         Ok(())
     }
 
+    /// The joints from which the inverse kinematics of the first boundary begins.
+    pub fn restore_joints(&mut self, q: &[f64]) {
+        self.targets[0].state.q.copy_from_slice(q);
+    }
+
     /// Where base and mass centre go.
     pub fn aim(&self) -> &Aim {
         &self.aim
@@ -245,6 +253,29 @@ impl MotionReference {
     /// The aim at a boundary of the last grid.
     pub fn target(&self, boundary: usize) -> &Target {
         &self.targets[boundary]
+    }
+
+    /// How well the legs reach their footholds at a time with the mass centre where the aim has it: the error that is left of the feet (m, rad), and
+    /// the least distance of a leg's joint from its stops (rad).
+    ///
+    /// # Errors
+    /// When the mechanics refuse a posture.
+    pub fn reach(
+        &mut self,
+        model: &LeggedModel,
+        schedule: &ContactSchedule,
+        time_s: f64,
+    ) -> Result<(f64, f64), StepError> {
+        self.place(model, 0, time_s, schedule)?;
+        let target = &mut self.targets[0];
+        let pose = target.state.base_pose_w();
+        let error = self.legs.solve(model, &pose, &target.feet, &mut target.state.q, REACH_ITERATIONS)?;
+        let joints = (0..model.feet.len()).flat_map(|foot| self.legs.leg(foot).iter());
+        let margin = |joint: &usize| {
+            let (q, limit) = (target.state.q[*joint], &model.limits[*joint]);
+            (q - limit.lower).min(limit.upper - q)
+        };
+        Ok((error, joints.map(margin).fold(f64::INFINITY, f64::min)))
     }
 
     /// Aims at all boundaries of `grid` with the feet as in `schedule`. No allocation.

@@ -175,7 +175,7 @@ pub struct LeggedSettings {
     pub swing_lift_m: f64,
     /// How far below the ground a swing ends, m; 0: by the robot's size.
     pub swing_depth_m: f64,
-    /// How far the mass centre goes down before the first step, m.
+    /// How far the mass centre goes down before the first step, m; 0: by the reach of the legs.
     pub crouch_m: f64,
     /// Least normal force of a foot that stands, as a part of the weight.
     pub min_force_fraction: f64,
