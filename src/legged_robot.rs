@@ -10,6 +10,7 @@ use delmpc_horizon::legged_tasks::LeggedWeights;
 use delmpc_horizon::motion_reference::{MotionReference, SwingShape};
 use delmpc_horizon::stage_grid::StageGrid;
 use delmpc_horizon::step_plan::Step;
+use delmpc_lq::projected_qp::ProjectedQpOptions;
 use delmpc_mechanics::contact_stage::BoundaryState;
 use delmpc_mechanics::kinematics::{Configuration, Kinematics, base_pose_from_link};
 use delmpc_scenario::{ControllerKind, GaitKind, GaitSettings};
@@ -18,8 +19,12 @@ use nalgebra::Vector3;
 use crate::robot_controller::{estimator_config, estimator_model};
 use crate::setup::Setup;
 
-/// Lift of a swing foot, and where it ends below the ground, as parts of the height of the mass centre.
+/// Rows the dual has room for: those of all feet, and the joint ranges of two legs at their stops.
+const QP_ROWS: usize = 128;
+
+/// Lift of a swing foot, flat or a point, and where it ends below the ground, as parts of the height of the mass centre.
 const LIFT_PART: f64 = 0.08;
+const POINT_LIFT_PART: f64 = 0.15;
 const DEPTH_PART: f64 = 0.004;
 
 /// The robot as the horizon has it.
@@ -82,6 +87,7 @@ pub fn config(setup: &Setup, model: &LeggedModel) -> Result<LeggedConfig, String
     let period_s = 1.0 / settings.mpc_rate_hz;
     let height = mass_centre_height(model)?;
     let or = |value: f64, part: f64| if value > 0.0 { value } else { part * height };
+    let lift = if model.feet.iter().any(FootShape::is_flat) { LIFT_PART } else { POINT_LIFT_PART };
     let core_config = core::ControllerConfig::default();
     Ok(LeggedConfig {
         kind: match settings.kind {
@@ -119,12 +125,12 @@ pub fn config(setup: &Setup, model: &LeggedModel) -> Result<LeggedConfig, String
             ..LeggedLimits::default()
         },
         swing: SwingShape {
-            lift_m: or(legged.swing_lift_m, LIFT_PART),
+            lift_m: or(legged.swing_lift_m, lift),
             depth_m: or(legged.swing_depth_m, DEPTH_PART),
         },
         crouch_m: legged.crouch_m,
         motion: motion(setup, model)?,
-        qp: core_config.qp,
+        qp: ProjectedQpOptions { capacity: QP_ROWS, ..core_config.qp },
         fallback: core_config.fallback,
         max_state_age_s: settings.max_state_age_s,
         command_life_s: settings.command_life_s,

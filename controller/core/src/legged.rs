@@ -25,7 +25,7 @@ use delmpc_horizon::legged_problem::{LeggedLimits, LeggedProblem};
 use delmpc_horizon::legged_tasks::LeggedWeights;
 use delmpc_horizon::motion_plan::MotionPlan;
 use delmpc_horizon::motion_reference::{MotionReference, SwingShape};
-use delmpc_horizon::retiming::retime;
+use delmpc_horizon::retiming::Retiming;
 use delmpc_horizon::stage_grid::StageGrid;
 use delmpc_horizon::step_plan::{Step, lay_out, mass_centre_over};
 use delmpc_lq::dual_qp::QpSolver;
@@ -158,6 +158,7 @@ pub struct LeggedController {
     grid: StageGrid,
     reference: MotionReference,
     walk: Option<GaitWalk>,
+    retiming: Retiming,
     ground: GroundPlane,
     /// Whether a foot is flat.
     flat: Vec<bool>,
@@ -173,6 +174,8 @@ pub struct LeggedController {
     plan: MotionPlan,
     nominal: MotionPlan,
     has_plan: bool,
+    /// The last plan is out of reach: the next problem is one about the aim.
+    is_astray: bool,
     prediction: StatePrediction,
     measured: BoundaryState,
     predicted: BoundaryState,
@@ -219,6 +222,7 @@ impl LeggedController {
         Ok(Self {
             sensing: LeggedSensing::new(&robot)?,
             ladder: FallbackLadder::new(config.fallback),
+            retiming: Retiming::new(places.len()),
             ground: GroundPlane::new(&places, &flat),
             flat,
             height_m: reference.aim().height_m,
@@ -233,6 +237,7 @@ impl LeggedController {
             nominal: plan.clone(),
             plan,
             has_plan: false,
+            is_astray: false,
             prediction: StatePrediction::new(model)?,
             measured: model.posture.clone(),
             predicted: model.posture.clone(),
@@ -420,8 +425,8 @@ impl LeggedController {
     fn look_ahead(&mut self, measured_s: f64, start_s: f64) -> Result<(), u32> {
         let Self { schedule, grid, reference, walk, sensing, robot, ground, .. } = self;
         let model = &robot.model;
-        self.retimed =
-            retime(schedule, sensing.feet(), measured_s, start_s - measured_s + self.config.period_s);
+        let times = (self.config.period_s, start_s - measured_s);
+        self.retimed = self.retiming.update(schedule, sensing.feet(), measured_s, times);
         ground.update(schedule, sensing.feet(), measured_s, self.config.period_s);
         let aim = reference.aim_mut();
         let [place, ..] = aim.mass_centre_at(measured_s);
@@ -457,13 +462,14 @@ impl LeggedController {
 
     /// The last plan on the new grid, its first boundary where the robot will be; what lies beyond it is the aim.
     fn resample(&mut self) {
+        let follows = self.has_plan && !self.is_astray;
         let Self { plan, nominal, grid, reference, problem, scratch, .. } = self;
         let stages = grid.stages();
         nominal.times.copy_from_slice(grid.times());
         for k in 0..=stages {
             let (time_s, target) = (grid.times()[k], reference.target(k));
             let state = &mut nominal.states[k];
-            match self.has_plan && time_s <= plan.end_s() {
+            match follows && time_s <= plan.end_s() {
                 true => {
                     plan.state_at(time_s, scratch);
                     state.copy_from(scratch);
@@ -475,7 +481,7 @@ impl LeggedController {
         let stage = problem.contact_stage();
         for k in 0..stages {
             let (middle, target) = (0.5 * (grid.times()[k] + grid.times()[k + 1]), reference.target(k));
-            let known = self.has_plan && middle < plan.end_s();
+            let known = follows && middle < plan.end_s();
             let of = plan.stage_at(middle);
             let source = if known { plan.input(of) } else { &target.torque };
             nominal.input_mut(k).copy_from_slice(source);
@@ -492,6 +498,7 @@ impl LeggedController {
     fn adopt_plan(&mut self) -> Result<(), u32> {
         let positions = 6 + self.robot.model.tree.joint_count();
         if (0..=self.solution.stages()).any(|k| largest(&self.solution.x(k)[..positions]) > LARGEST_MOVE) {
+            self.is_astray = true;
             return Err(reason::FAR);
         }
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
@@ -508,7 +515,7 @@ impl LeggedController {
             }
         }
         core::mem::swap(&mut self.plan, &mut self.nominal);
-        self.has_plan = true;
+        (self.has_plan, self.is_astray) = (true, false);
         Ok(())
     }
 

@@ -40,6 +40,8 @@ pub struct Stance {
     pub begin_s: f64,
     /// Lift-off, s; infinite: none planned.
     pub end_s: f64,
+    /// Lift-off as it was planned, s.
+    pub lift_planned_s: f64,
     /// Where.
     pub place: Foothold,
 }
@@ -80,7 +82,8 @@ impl ContactSchedule {
     pub fn standing(places: &[Foothold], room: usize) -> Self {
         let foot = |place: &Foothold| {
             let mut stances = Vec::with_capacity(room.max(2));
-            stances.push(Stance { begin_s: f64::NEG_INFINITY, end_s: f64::INFINITY, place: *place });
+            let (begin_s, end_s) = (f64::NEG_INFINITY, f64::INFINITY);
+            stances.push(Stance { begin_s, end_s, lift_planned_s: end_s, place: *place });
             stances
         };
         Self { feet: places.iter().map(foot).collect() }
@@ -138,8 +141,9 @@ impl ContactSchedule {
         if full || !(lift_s > last.begin_s && touch_s > lift_s) {
             return false;
         }
-        last.end_s = lift_s;
-        stances.push(Stance { begin_s: touch_s, end_s: f64::INFINITY, place: to });
+        (last.end_s, last.lift_planned_s) = (lift_s, lift_s);
+        let end_s = f64::INFINITY;
+        stances.push(Stance { begin_s: touch_s, end_s, lift_planned_s: end_s, place: to });
         true
     }
 
@@ -168,6 +172,28 @@ impl ContactSchedule {
             let latest = stances[next].end_s;
             stances[next].begin_s = touch_s.max(earliest).min(latest);
         }
+    }
+
+    /// A foot that shall stand at `time_s` is in the air until `touch_s`.
+    pub fn lift_again(&mut self, foot: usize, time_s: f64, touch_s: f64) {
+        if let Some(stance) = self.stance_at(foot, time_s) {
+            stance.begin_s = touch_s.min(stance.end_s);
+        }
+    }
+
+    /// A foot that stands at `time_s` lifts off at `lift_s` instead, but keeps the part `1 - most` of its swing. `false`: that is over.
+    pub fn move_lift_off(&mut self, foot: usize, time_s: f64, lift_s: f64, most: f64) -> bool {
+        let Some(stances) = self.feet.get_mut(foot) else { return false };
+        let now = stances.iter().rposition(|stance| stance.begin_s <= time_s + SAME_TIME_S);
+        let Some(now) = now else { return false };
+        let Some(touch_s) = stances.get(now + 1).map(|next| next.begin_s) else { return false };
+        // The planned swing is what is left plus what has been waited for.
+        let latest_s = touch_s - (1.0 - most) * (touch_s - stances[now].lift_planned_s);
+        let moved = lift_s <= latest_s + SAME_TIME_S;
+        if moved {
+            stances[now].end_s = lift_s;
+        }
+        moved
     }
 
     /// The place a foot swings to at `time_s` changes.

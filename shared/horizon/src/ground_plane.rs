@@ -162,7 +162,7 @@ mod tests {
             place: Foothold { position_w: Vector3::new(0.0, y, 0.01), axes_w },
         });
         for k in 0..2000 {
-            ground.update(&mut schedule, &feet, 0.005 * f64::from(k), 0.005);
+            ground.update(&mut schedule, &feet, 4e-4 * f64::from(k), 0.005);
         }
         assert!((ground.gradient() - Vector2::new(0.1, 0.0)).norm() < 1e-3);
         ground.update(&mut schedule, &feet, 1.0, 0.005);
@@ -183,7 +183,7 @@ mod tests {
         let feet =
             corners.map(|(x, y)| FootState { loaded: true, place: at(x, y, 0.2 * x - 0.1 * y + 0.03) });
         for k in 0..2000 {
-            ground.update(&mut schedule, &feet, 0.005 * f64::from(k), 0.005);
+            ground.update(&mut schedule, &feet, 4e-4 * f64::from(k), 0.005);
         }
         assert!((ground.gradient() - Vector2::new(0.2, -0.1)).norm() < 1e-3);
         assert!((ground.offset_m(&Vector2::new(0.1, 0.0)) - 0.05).abs() < 1e-3);

@@ -2,11 +2,16 @@
 //!
 //! | seen | done |
 //! |---|---|
-//! | a foot past half of its swing carries load | it stands, from now on and where it is |
+//! | a foot that has left the ground and is past 0.7 of its swing carries load | it stands, from now on and where it is |
 //! | a foot shall touch down before the next cycle and carries none | it goes on down: the switch moves by a cycle, or by the time the rest takes |
 //! | a foot that stands | the schedule has it where it is |
+//! | a foot that shall stand has carried nothing for 30 ms | it bounced, or never landed: it is in the air, on its way down |
+//! | a foot shall lift off while another one is late | it waits for that one, up to half of its own swing |
 //!
 //! What comes later stays as it was planned.
+
+use alloc::vec;
+use alloc::vec::Vec;
 
 use nalgebra::Vector3;
 
@@ -27,40 +32,106 @@ pub struct FootState {
     pub place: Foothold,
 }
 
-/// Moves the switches of a cycle at `now_s`, the next one after `period_s`. Returns a bit for every foot that came early or late.
-pub fn retime(schedule: &mut ContactSchedule, feet: &[FootState], now_s: f64, period_s: f64) -> u32 {
-    let mut moved = 0;
-    for (k, foot) in feet.iter().enumerate() {
-        match schedule.phase(k, now_s) {
-            FootPhase::Stance(_) => {
-                if foot.loaded {
-                    schedule.place(k, now_s, foot.place);
+/// Part of a swing after which a load is a landing: before, it is a stumble.
+const LANDS_FROM: f64 = 0.7;
+/// A foot that shall stand and carries nothing for so long is in the air, s.
+const UNLOADED_S: f64 = 0.03;
+/// A lift-off waits for a late foot up to this part of its swing.
+const WAITS: f64 = 0.5;
+
+/// What has been felt of the feet so far.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Retiming {
+    /// The foot has been without load in its present swing.
+    lifted: Vec<bool>,
+    /// How long a foot that shall stand has carried nothing, s.
+    unloaded_s: Vec<f64>,
+    late: Vec<bool>,
+}
+
+impl Retiming {
+    /// For `feet` feet.
+    pub fn new(feet: usize) -> Self {
+        Self { lifted: vec![false; feet], unloaded_s: vec![0.0; feet], late: vec![false; feet] }
+    }
+
+    /// Moves the switches of a cycle at `now_s`, the next one after `period_s`; what is decided acts `delay_s` later. Returns a bit for
+    /// every foot whose switch has moved. No allocation.
+    pub fn update(
+        &mut self,
+        schedule: &mut ContactSchedule,
+        feet: &[FootState],
+        now_s: f64,
+        (period_s, delay_s): (f64, f64),
+    ) -> u32 {
+        let mut moved = 0;
+        let ahead_s = period_s + delay_s;
+        for (k, foot) in feet.iter().enumerate().take(self.late.len()) {
+            self.late[k] = false;
+            match schedule.phase(k, now_s) {
+                FootPhase::Stance(stance) => {
+                    self.lifted[k] = false;
+                    if foot.loaded {
+                        self.unloaded_s[k] = 0.0;
+                        schedule.place(k, now_s, foot.place);
+                    } else {
+                        self.unloaded_s[k] += period_s;
+                        if self.unloaded_s[k] >= UNLOADED_S && stance.end_s > now_s + 2.0 * ahead_s {
+                            self.late[k] = true;
+                            let gap = (foot.place.position_w.z - stance.place.position_w.z).max(0.0);
+                            let rest = (gap / SEARCH_SPEED_M_S).max(period_s);
+                            (self.lifted[k], self.unloaded_s[k]) = (true, 0.0);
+                            schedule.lift_again(k, now_s, now_s + ahead_s + rest);
+                            moved |= 1 << k;
+                        }
+                    }
+                }
+                FootPhase::Swing(swing) => {
+                    self.unloaded_s[k] = 0.0;
+                    self.lifted[k] |= !foot.loaded;
+                    let lands_s = swing.begin_s + LANDS_FROM * (swing.end_s - swing.begin_s);
+                    let lands = !lands_s.is_finite() || now_s > lands_s;
+                    if foot.loaded && self.lifted[k] && lands {
+                        schedule.move_touchdown(k, now_s, now_s);
+                        schedule.place(k, now_s, foot.place);
+                        moved |= 1 << k;
+                    } else if !foot.loaded && swing.end_s < now_s + ahead_s {
+                        self.late[k] = true;
+                        let gap = (foot.place.position_w.z - swing.to.position_w.z).max(0.0);
+                        let rest = (gap / SEARCH_SPEED_M_S).max(period_s);
+                        let mut to = swing.to;
+                        let near = gap < SEARCH_SPEED_M_S * period_s;
+                        if near && swing.from.position_w.z - to.position_w.z < DEEPEST_M {
+                            // The ground is lower than it was thought to be.
+                            to.position_w.z -= SEARCH_SPEED_M_S * period_s;
+                            schedule.aim(k, now_s, to);
+                        }
+                        schedule.move_touchdown(k, now_s, now_s + ahead_s + rest);
+                        moved |= 1 << k;
+                    }
                 }
             }
-            FootPhase::Swing(swing) => {
-                let half = 0.5 * (swing.begin_s + swing.end_s);
-                if foot.loaded && now_s > half {
-                    schedule.move_touchdown(k, now_s, now_s);
-                    schedule.place(k, now_s, foot.place);
-                    moved |= 1 << k;
-                } else if !foot.loaded && swing.end_s < now_s + period_s {
-                    let gap = (foot.place.position_w.z - swing.to.position_w.z).max(0.0);
-                    let rest = (gap / SEARCH_SPEED_M_S).max(period_s);
-                    let mut to = swing.to;
-                    if gap < SEARCH_SPEED_M_S * period_s
-                        && swing.from.position_w.z - to.position_w.z < DEEPEST_M
-                    {
-                        // The ground is lower than it was thought to be.
-                        to.position_w.z -= SEARCH_SPEED_M_S * period_s;
-                        schedule.aim(k, now_s, to);
-                    }
-                    schedule.move_touchdown(k, now_s, now_s + period_s + rest);
+        }
+        if self.late.contains(&true) {
+            moved |= self.wait(schedule, now_s, period_s, ahead_s);
+        }
+        moved
+    }
+
+    /// Feet that are about to lift off wait for those that are late.
+    fn wait(&self, schedule: &mut ContactSchedule, now_s: f64, period_s: f64, ahead_s: f64) -> u32 {
+        let mut moved = 0;
+        for k in (0..self.late.len()).filter(|k| !self.late[*k]) {
+            if let FootPhase::Stance(stance) = schedule.phase(k, now_s) {
+                if stance.end_s < now_s + ahead_s
+                    && schedule.move_lift_off(k, now_s, stance.end_s + period_s, WAITS)
+                {
                     moved |= 1 << k;
                 }
             }
         }
+        moved
     }
-    moved
 }
 
 /// The foothold of a measured sole: a flat foot's axes are those of the ground it lies on, a point's ground is level.
@@ -88,26 +159,63 @@ mod tests {
         schedule
     }
 
+    const TIMES: (f64, f64) = (0.01, 0.0);
+
+    fn foot(loaded: bool, x: f64, z: f64) -> [FootState; 1] {
+        [FootState { loaded, place: at(x, z) }]
+    }
+
     #[test]
     fn an_early_foot_stands_where_it_is() {
-        let mut schedule = swinging();
-        let feet = [FootState { loaded: true, place: at(0.28, 0.01) }];
-        assert_eq!(retime(&mut schedule, &feet, 1.1, 0.01), 0, "still at its lift-off");
-        assert_eq!(retime(&mut schedule, &feet, 1.35, 0.01), 1);
+        let (mut schedule, mut retiming) = (swinging(), Retiming::new(1));
+        let scuffs = foot(true, 0.28, 0.01);
+        assert_eq!(retiming.update(&mut schedule, &scuffs, 1.1, TIMES), 0, "it has not left the ground");
+        assert_eq!(retiming.update(&mut schedule, &foot(false, 0.1, 0.05), 1.15, TIMES), 0);
+        assert_eq!(retiming.update(&mut schedule, &scuffs, 1.2, TIMES), 0, "a stumble");
+        assert_eq!(retiming.update(&mut schedule, &scuffs, 1.35, TIMES), 1);
         let FootPhase::Stance(stance) = schedule.phase(0, 1.35) else { panic!("swings") };
         assert_eq!((stance.begin_s, stance.place), (1.35, at(0.28, 0.01)));
     }
 
     #[test]
     fn a_late_foot_goes_on_down() {
-        let mut schedule = swinging();
-        let mut feet = [FootState { loaded: false, place: at(0.3, 0.015) }];
-        assert_eq!(retime(&mut schedule, &feet, 1.38, 0.01), 0);
-        assert_eq!(retime(&mut schedule, &feet, 1.395, 0.01), 1);
+        let (mut schedule, mut retiming) = (swinging(), Retiming::new(1));
+        let high = foot(false, 0.3, 0.015);
+        assert_eq!(retiming.update(&mut schedule, &high, 1.38, TIMES), 0);
+        assert_eq!(retiming.update(&mut schedule, &high, 1.395, TIMES), 1);
         assert!(!schedule.stands(0, 1.49) && schedule.stands(0, 1.51));
-        feet[0].place = at(0.3, 0.0);
-        retime(&mut schedule, &feet, 1.5, 0.01);
+        retiming.update(&mut schedule, &foot(false, 0.3, 0.0), 1.5, TIMES);
         let FootPhase::Swing(swing) = schedule.phase(0, 1.5) else { panic!("stands") };
         assert!(swing.to.position_w.z < -0.001 && swing.end_s > 1.51);
+    }
+
+    #[test]
+    fn a_foot_that_bounced_lands_again() {
+        let (mut schedule, mut retiming) = (swinging(), Retiming::new(1));
+        retiming.update(&mut schedule, &foot(false, 0.2, 0.03), 1.3, TIMES);
+        retiming.update(&mut schedule, &foot(true, 0.28, 0.0), 1.36, TIMES);
+        let up = foot(false, 0.28, 0.003);
+        let moved: Vec<u32> =
+            (0..3).map(|k| retiming.update(&mut schedule, &up, 1.37 + 0.01 * f64::from(k), TIMES)).collect();
+        assert_eq!(moved, [0, 0, 1]);
+        assert!(!schedule.stands(0, 1.4) && schedule.stands(0, 1.421));
+        assert_eq!(retiming.update(&mut schedule, &foot(true, 0.28, 0.0), 1.4, TIMES), 1);
+        assert!(schedule.stands(0, 1.401));
+    }
+
+    #[test]
+    fn a_lift_off_waits_for_a_late_foot() {
+        let mut schedule = ContactSchedule::standing(&[at(0.0, 0.0), at(0.0, 0.0)], 4);
+        schedule.step(0, 1.0, 1.4, at(0.3, 0.0));
+        schedule.step(1, 1.4, 1.8, at(0.3, 0.0));
+        let mut retiming = Retiming::new(2);
+        let feet = [foot(false, 0.3, 0.01)[0], foot(true, 0.0, 0.0)[0]];
+        assert_eq!(retiming.update(&mut schedule, &feet, 1.395, TIMES), 3);
+        assert!(schedule.stands(1, 1.405) && !schedule.stands(1, 1.411));
+        // Not for ever.
+        for k in 0..100 {
+            retiming.update(&mut schedule, &feet, 1.4 + 0.01 * f64::from(k), TIMES);
+        }
+        assert!(schedule.stances(1)[0].end_s <= 1.6 + 1e-9);
     }
 }
