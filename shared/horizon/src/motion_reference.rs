@@ -261,13 +261,7 @@ impl MotionReference {
         let wrench = Vector6::new(0.0, 0.0, 0.0, carried.x, carried.y, carried.z);
         share_load(shares, rows, &target.mass_centre_w, &wrench, &mut target.force);
         kinematics.update(&model.tree, &target.state)?;
-        kinematics.static_torques_into(
-            &model.tree,
-            &target.state.q,
-            contacts,
-            &target.force,
-            &mut target.torque,
-        )?;
+        kinematics.static_torques_into(&model.tree, contacts, &target.force, &mut target.torque)?;
         for (torque, limit) in target.torque.iter_mut().zip(&model.limits) {
             *torque = torque.clamp(-limit.effort, limit.effort);
         }
