@@ -59,6 +59,10 @@ const OLDER_STATES: u32 = 5;
 
 /// A violation beyond this part of a constraint's scale is reported as [`Verdict::Infeasible`].
 const GAVE_WAY: f64 = 1e-3;
+/// Torques and contact forces of a plan may be beyond their limits by this part of their scale in the stages a command covers ...
+const UNMET_NEAR: f64 = 0.05;
+/// ... and by this later, where there is time for a better plan.
+const UNMET_FAR: f64 = 0.5;
 /// A plan that moves a node by more than this (rad, m) is not believed.
 const LARGEST_MOVE: f64 = 2.0;
 /// How much later than the nominal's start a state may be, in horizons: what comes after the cycle that was held up is fresh again.
@@ -312,9 +316,9 @@ impl Controller {
         self.command.report.riccati_ns = prepared.riccati_ns;
         let solved = self.solve_constrained();
         self.command.report.qp_ns = watch.lap();
-        let report = solved?;
+        self.report_constraints(&solved?);
+        self.check_followable()?;
         self.adopt_plan()?;
-        self.report_constraints(&report);
         Ok(())
     }
 
@@ -487,6 +491,16 @@ impl Controller {
         let problem = &self.horizon.problem;
         let solved = self.qp.solve(problem, &self.riccati, self.backend.as_mut(), &mut self.solution);
         solved.map_err(|_| reason::QP)
+    }
+
+    /// A solution that leaves torque limits or contact rows out is none: sent to the robot, it would throw it.
+    fn check_followable(&self) -> Result<(), u32> {
+        let offsets = self.nominal.offsets();
+        let followable = (0..self.solution.stages()).all(|k| {
+            let allowed = if offsets[k] < self.config.command_life_s { UNMET_NEAR } else { UNMET_FAR };
+            self.qp.unmet(k) <= allowed
+        });
+        if followable { Ok(()) } else { Err(reason::QP) }
     }
 
     /// The solution becomes the plan, unless it is out of reach of the linearisation.
