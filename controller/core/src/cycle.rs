@@ -204,7 +204,7 @@ impl Controller {
             estimator: Estimator::new(&model)?,
             unloaded_leg,
             ladder: FallbackLadder::new(config.fallback),
-            reference: Reference { home, reach: None, com_shift: Vector3::zeros() },
+            reference: Reference::at(home),
             asked_reach: None,
             hand_distance_left_m: 0.0,
             trim: BalanceTrim::new(config.trim_s),
@@ -350,6 +350,7 @@ impl Controller {
     fn prepare_for(&mut self, start_s: f64, watch: &mut StopWatch<'_>) -> Result<Preparation, u32> {
         self.shift_nominal(start_s);
         let shift_ns = watch.lap();
+        self.horizon.place_sole(&self.estimator.estimate().sole_pose);
         self.horizon
             .linearise(&self.model, &self.config, &self.reference, &self.nominal)
             .map_err(|_| reason::STAGE)?;
@@ -392,13 +393,14 @@ impl Controller {
         self.force_change += FORCE_SMOOTHING * (change - self.force_change);
 
         let measured_s = self.run_time_s(state.time_ns);
-        self.reference.com_shift = Vector3::zeros();
+        let sole_pose = self.estimator.estimate().sole_pose;
+        self.reference.stand_on(&sole_pose, &Vector3::zeros());
         self.reference.sample(measured_s, &mut self.targets);
         if let Some(wrench) = wrench {
             let rates = &self.estimator.estimate().q_dot;
             self.trim.update(&self.targets.com, &wrench.torque, &wrench.force, rates, since_last_s);
         }
-        self.reference.com_shift = self.trim.shift();
+        self.reference.stand_on(&sole_pose, &self.trim.shift());
         self.test_innovation(measured_s);
         let Estimate { q, q_dot, .. } = self.estimator.estimate();
         self.predicted[..n].copy_from_slice(q);
