@@ -269,6 +269,7 @@ fn config(setup: &Setup, holding: &Holding, start: &Start) -> Result<PlantConfig
             delay: plant.actuator_delay_s,
             ..ActuatorConfig::default()
         },
+        joint_ranges: robot.limits.iter().map(|limit| [limit.lower, limit.upper]).collect(),
         terrain: terrain(scenario),
         contact: ContactOptions { ground: ground(setup), ..ContactOptions::default() },
         sensors: sensors(setup)?,
