@@ -69,11 +69,12 @@ const PUSH_MAP_EXAMPLES: &str = "\
 Examples:
   delmpc push-map                                        main scenario, 8 directions
   delmpc push-map --controller mpc,static-lqr            against a fixed LQR
-  delmpc push-map --link utorso,pelvis --directions 16 --seeds 3
+  delmpc push-map --link utorso,pelvis --directions 16 --seeds 3   each push with 3 seeds of the noise instead of 6
   delmpc push-map configs/examples/lamp/reach.toml --link upper_arm --json
   delmpc push-map --set sensors.noise_scale=5 --out /tmp/noisy
 
 A push is survived when the robot does not fall, keeps its other foot in the air and comes to rest. \
+The limit is the largest impulse below which all seeds survive; beside it the shares that survive at 90, 100, 110 %. \
 Beside each limit stands the capture limit: what an inverted pendulum with a massless leg survives in that direction.";
 
 const REPLAY_EXAMPLES: &str = "\

@@ -3,6 +3,10 @@
 //! Each trial is a whole run of the scenario in one thread: rest, one push, time to recover. A trial is survived when the robot does not
 //! fall, keeps its other foot off the ground, keeps slip and tilt of the stance sole within the scenario's limits and comes to rest.
 //!
+//! Survival is not monotone near its end: one seed of the noise may take 45 N·s where another one does not take 42. So every impulse
+//! is tried with several seeds, and the figure is the largest one below which all of them survive, as far as it has been looked at: all
+//! survive the figure itself and 95, 90 and 80 % of it. Beside it stand the shares that survive at 90, 100 and 110 %.
+//!
 //! Beside each figure stands the capture limit of the linear inverted pendulum: an impulse `J` gives a point mass `m` at height `h` above
 //! the sole the speed `J/m`; with ankles alone it can be stopped while the capture point `c + v √(h/g)` stays over the sole, so
 //!
@@ -34,10 +38,18 @@ use crate::setup::{Setup, scenario_file};
 use crate::summary::Summary;
 use crate::verdict::{Ended, Failure};
 
+mod plot;
+
+use plot::polar_plot;
+
 /// Rest before the push (s).
 const REST_S: f64 = 0.5;
 /// Largest impulse tried (N s).
 const MOST_NS: f64 = 400.0;
+/// Parts of a limit that have to be survived too.
+const BELOW: [f64; 3] = [0.8, 0.9, 0.95];
+/// Parts of a limit at which shares are told.
+const SHARES_AT: [f64; 3] = [0.9, 1.0, 1.1];
 
 /// Arguments of `delmpc push-map`.
 #[derive(Debug, Clone, clap::Args)]
@@ -65,8 +77,8 @@ pub struct PushMapArguments {
     /// The bisection ends at this width, N s
     #[arg(long, default_value_t = 1.0)]
     pub resolution_ns: f64,
-    /// Seeds per direction; the table has the least, the mean and the largest of their limits
-    #[arg(long, default_value_t = 1)]
+    /// Seeds of the noise every impulse is tried with, from the scenario's on; all of them have to survive
+    #[arg(long, default_value_t = 6)]
     pub seeds: u64,
     /// Runs at the same time [default: as many as there are cores]
     #[arg(long)]
@@ -85,7 +97,16 @@ struct Search {
     controller: String,
     link: String,
     angle_rad: f64,
-    seed: u64,
+}
+
+/// What was found for it.
+#[derive(Debug, Clone, Default)]
+struct Found {
+    /// Largest impulse below which all seeds survive, N s.
+    limit_ns: f64,
+    /// Shares of the seeds that survive [`SHARES_AT`] of it.
+    shares: [f64; 3],
+    failure: Option<String>,
 }
 
 /// One line of the map.
@@ -97,12 +118,16 @@ pub struct Limit {
     pub link: String,
     /// Direction of the push, from straight ahead to the left.
     pub angle_rad: f64,
-    /// Largest impulse survived by every seed.
+    /// Seeds every impulse was tried with.
+    pub seeds: u64,
+    /// Largest impulse below which every seed survives.
     pub least_ns: f64,
-    /// Mean over the seeds.
-    pub mean_ns: f64,
-    /// Largest over the seeds.
-    pub most_ns: f64,
+    /// Share of the seeds that survive 90 % of it.
+    pub share_at_90_percent: f64,
+    /// Share that survive it: all, or nothing was survived.
+    pub share_at_100_percent: f64,
+    /// Share that survive 110 % of it.
+    pub share_at_110_percent: f64,
     /// Limit of the linear inverted pendulum.
     pub capture_limit_ns: f64,
     /// `least_ns / capture_limit_ns`.
@@ -124,7 +149,7 @@ pub fn push_map(arguments: &PushMapArguments) -> Result<Ended, Failure> {
     if stop.is_set() {
         return Ok(Ended::Interrupted);
     }
-    let limits = gather(&setup, &searches, &found);
+    let limits = gather(&setup, arguments.seeds, &searches, found);
     let write = |name: &str, text: &str| {
         let file = folder.join(name);
         std::fs::write(&file, text).map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))
@@ -175,12 +200,7 @@ fn searches(arguments: &PushMapArguments, setup: &Setup) -> Result<Vec<Search>, 
         for link in &arguments.link {
             for direction in 0..arguments.directions {
                 let angle_rad = std::f64::consts::TAU * direction as f64 / arguments.directions as f64;
-                searches.extend((0..arguments.seeds).map(|seed| Search {
-                    controller: controller.clone(),
-                    link: link.clone(),
-                    angle_rad,
-                    seed: setup.scenario.seed + seed,
-                }));
+                searches.push(Search { controller: controller.clone(), link: link.clone(), angle_rad });
             }
         }
     }
@@ -197,30 +217,31 @@ fn controller_kind(name: &str) -> Result<delmpc_scenario::ControllerKind, Failur
     }
 }
 
-/// Limits in the order of the searches, each with what ended the smallest push not survived.
-type Found = Vec<(f64, Option<String>)>;
-
 fn search_all(
     arguments: &PushMapArguments,
     setup: &Setup,
     searches: &[Search],
     stop: &StopFlag,
-) -> Result<Found, Failure> {
+) -> Result<Vec<Found>, Failure> {
     let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
     let jobs = arguments.jobs.unwrap_or(cores).clamp(1, searches.len());
     let bar = if arguments.json { ProgressBar::hidden() } else { ProgressBar::new(searches.len() as u64) };
     let style = ProgressStyle::with_template("{bar:30} {pos}/{len} directions, {eta} left  {msg}");
     bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
     let next = AtomicUsize::new(0);
-    let found = Mutex::new(vec![(f64::NAN, None); searches.len()]);
+    let found = Mutex::new(vec![Found::default(); searches.len()]);
     let broken = Mutex::new(None);
     std::thread::scope(|scope| {
         for _ in 0..jobs {
             scope.spawn(|| {
                 while let Some((index, search)) = take_next(&next, searches) {
-                    match bisect(arguments, setup, search, stop) {
+                    let trials = |impulse_ns: f64, seed: u64| {
+                        trial(arguments, setup, search, impulse_ns, setup.scenario.seed + seed, stop)
+                    };
+                    let first_ns = capture_limit(setup, search.angle_rad);
+                    match find(arguments, first_ns, &trials, stop) {
                         Ok(limit) => {
-                            bar.set_message(format!("last: {:.0} N·s", limit.0));
+                            bar.set_message(format!("last: {:.0} N·s", limit.limit_ns));
                             lock(&found)[index] = limit;
                         }
                         Err(failure) => {
@@ -252,24 +273,69 @@ fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
-/// Largest impulse survived (N s), found from the capture limit outwards.
-fn bisect(
+/// Why a push of an impulse (N s) was not survived with a seed, counted from the scenario's; `None`: it was.
+type Trials<'a> = dyn Fn(f64, u64) -> Result<Option<String>, Failure> + 'a;
+
+/// The largest impulse below which all seeds survive, found from `first_ns` outwards, and the shares about it.
+fn find(
     arguments: &PushMapArguments,
-    setup: &Setup,
-    search: &Search,
+    first_ns: f64,
+    trials: &Trials<'_>,
     stop: &StopFlag,
-) -> Result<(f64, Option<String>), Failure> {
-    let (mut survived, mut lost) = (0.0, f64::INFINITY);
-    let mut failure = None;
-    let mut impulse_ns = capture_limit(setup, search.angle_rad);
-    while lost - survived > arguments.resolution_ns && survived < MOST_NS && !stop.is_set() {
-        match trial(arguments, setup, search, impulse_ns, stop)? {
-            None => survived = impulse_ns,
-            Some(why) => (lost, failure) = (impulse_ns, Some(why)),
+) -> Result<Found, Failure> {
+    let why_not = |impulse_ns: f64| -> Result<Option<String>, Failure> {
+        for seed in 0..arguments.seeds {
+            let why = trials(impulse_ns, seed)?;
+            if why.is_some() {
+                return Ok(why);
+            }
         }
-        impulse_ns = if lost.is_finite() { 0.5 * (survived + lost) } else { 1.25 * survived };
+        Ok(None)
+    };
+    let (mut survived, mut lost, mut failure) = (0.0, f64::INFINITY, None);
+    let mut impulse_ns = first_ns;
+    loop {
+        while lost - survived > arguments.resolution_ns && survived < MOST_NS && !stop.is_set() {
+            match why_not(impulse_ns)? {
+                None => survived = impulse_ns,
+                Some(why) => (lost, failure) = (impulse_ns, Some(why)),
+            }
+            impulse_ns = if lost.is_finite() { 0.5 * (survived + lost) } else { 1.25 * survived };
+        }
+        // One that is lost below what is survived: the limit is below that.
+        let (limit_ns, mut below_ns) = (survived, 0.0);
+        for part in BELOW.into_iter().filter(|_| limit_ns > 0.0) {
+            if stop.is_set() {
+                break;
+            }
+            if let Some(why) = why_not(part * limit_ns)? {
+                (survived, lost, failure) = (below_ns, part * limit_ns, Some(why));
+                impulse_ns = 0.5 * (survived + lost);
+                break;
+            }
+            below_ns = part * limit_ns;
+        }
+        if survived == limit_ns || stop.is_set() {
+            break;
+        }
     }
-    Ok((survived, failure))
+    let mut shares = [1.0; 3];
+    for (share, part) in shares.iter_mut().zip(SHARES_AT) {
+        // All survive the limit and what is below.
+        if part > 1.0 || survived == 0.0 {
+            *share = share_of(arguments.seeds, part * survived, trials)?;
+        }
+    }
+    Ok(Found { limit_ns: survived, shares, failure })
+}
+
+/// Share of the seeds that survive an impulse.
+fn share_of(seeds: u64, impulse_ns: f64, trials: &Trials<'_>) -> Result<f64, Failure> {
+    let mut count = 0;
+    for seed in 0..seeds {
+        count += u64::from(trials(impulse_ns, seed)?.is_none());
+    }
+    Ok(count as f64 / seeds as f64)
 }
 
 /// Why the push was not survived; `None`: it was.
@@ -278,11 +344,12 @@ fn trial(
     setup: &Setup,
     search: &Search,
     impulse_ns: f64,
+    seed: u64,
     stop: &StopFlag,
 ) -> Result<Option<String>, Failure> {
     let mut setup = setup.clone();
     let scenario = &mut setup.scenario;
-    scenario.seed = search.seed;
+    scenario.seed = seed;
     scenario.controller.kind = controller_kind(&search.controller)?;
     scenario.push = vec![PushSettings {
         link: search.link.clone(),
@@ -333,134 +400,48 @@ fn edge_distance(polygon: &[Vector2<f64>], from: Vector2<f64>, direction: Vector
 }
 
 /// One line per controller, link and direction.
-fn gather(setup: &Setup, searches: &[Search], found: &Found) -> Vec<Limit> {
-    let mut limits: Vec<Limit> = Vec::new();
-    let mut counts: Vec<f64> = Vec::new();
-    for (search, (impulse_ns, failure)) in searches.iter().zip(found) {
-        let same = |limit: &Limit| {
-            limit.controller == search.controller
-                && limit.link == search.link
-                && limit.angle_rad == search.angle_rad
-        };
-        if !limits.last().is_some_and(same) {
-            limits.push(Limit {
-                controller: search.controller.clone(),
-                link: search.link.clone(),
-                angle_rad: search.angle_rad,
-                least_ns: f64::INFINITY,
-                mean_ns: 0.0,
-                most_ns: 0.0,
-                capture_limit_ns: capture_limit(setup, search.angle_rad),
-                ratio: 0.0,
-                failure: None,
-            });
-            counts.push(0.0);
+fn gather(setup: &Setup, seeds: u64, searches: &[Search], found: Vec<Found>) -> Vec<Limit> {
+    let limits = searches.iter().zip(found).map(|(search, found)| {
+        let capture_limit_ns = capture_limit(setup, search.angle_rad);
+        let [share_at_90_percent, share_at_100_percent, share_at_110_percent] = found.shares;
+        Limit {
+            controller: search.controller.clone(),
+            link: search.link.clone(),
+            angle_rad: search.angle_rad,
+            seeds,
+            least_ns: found.limit_ns,
+            share_at_90_percent,
+            share_at_100_percent,
+            share_at_110_percent,
+            capture_limit_ns,
+            ratio: found.limit_ns / capture_limit_ns,
+            failure: found.failure,
         }
-        if let (Some(limit), Some(count)) = (limits.last_mut(), counts.last_mut()) {
-            if *impulse_ns < limit.least_ns {
-                limit.least_ns = *impulse_ns;
-                limit.failure.clone_from(failure);
-            }
-            limit.most_ns = limit.most_ns.max(*impulse_ns);
-            limit.mean_ns = (limit.mean_ns * *count + impulse_ns) / (*count + 1.0);
-            *count += 1.0;
-            limit.ratio = limit.least_ns / limit.capture_limit_ns;
-        }
-    }
-    limits
+    });
+    limits.collect()
 }
 
 fn table(limits: &[Limit]) -> String {
     let mut text = String::from(
-        "controller   link      direction   survived N·s (mean, most)   capture limit   ratio   ended by\n",
+        "controller   link      direction   all survive N·s   share at 90, 100, 110 %   capture limit   ratio   ended by\n",
     );
     for limit in limits {
         let _ = writeln!(
             text,
-            "{:12} {:9} {:6.0}°     {:6.1} ({:5.1}, {:5.1})        {:6.1}        {:5.2}   {}",
+            "{:12} {:9} {:6.0}°     {:11.1}       {:4.2}  {:4.2}  {:4.2}          {:6.1}        {:5.2}   {}",
             limit.controller,
             limit.link,
             limit.angle_rad.to_degrees(),
             limit.least_ns,
-            limit.mean_ns,
-            limit.most_ns,
+            limit.share_at_90_percent,
+            limit.share_at_100_percent,
+            limit.share_at_110_percent,
             limit.capture_limit_ns,
             limit.ratio,
             limit.failure.as_deref().unwrap_or("-"),
         );
     }
     text
-}
-
-/// Survived impulse over direction, straight ahead is up, with the capture limit.
-fn polar_plot(limits: &[Limit]) -> String {
-    const SIZE: f64 = 560.0;
-    const COLOURS: [&str; 4] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7"];
-    let most = limits.iter().map(|limit| limit.least_ns.max(limit.capture_limit_ns)).fold(1.0, f64::max);
-    let ring = [5.0, 10.0, 20.0, 50.0, 100.0].into_iter().find(|ring| most / ring <= 5.0).unwrap_or(200.0);
-    let rings = (most / ring).ceil();
-    let scale = 0.40 * SIZE / (rings * ring);
-    let centre = 0.5 * SIZE;
-    let at = |angle: f64, radius: f64| {
-        (centre - scale * radius * angle.sin(), centre - scale * radius * angle.cos())
-    };
-    let mut svg = format!(
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {SIZE} {SIZE}\" font-family=\"sans-serif\" \
-         font-size=\"12\" fill=\"#333\">\n<rect width=\"{SIZE}\" height=\"{SIZE}\" fill=\"#fff\"/>\n\
-         <text x=\"16\" y=\"24\" font-size=\"15\">Largest push survived, N·s</text>\n"
-    );
-    for k in 1..=rings as usize {
-        let radius = k as f64 * ring;
-        let _ = writeln!(
-            svg,
-            "<circle cx=\"{centre}\" cy=\"{centre}\" r=\"{:.1}\" fill=\"none\" stroke=\"#ddd\"/>\
-             <text x=\"{:.1}\" y=\"{:.1}\" fill=\"#777\">{radius}</text>",
-            scale * radius,
-            centre + 3.0,
-            centre - scale * radius - 3.0
-        );
-    }
-    for (angle, name) in [(0.0, "forward"), (90.0, "left"), (180.0, "back"), (270.0, "right")] {
-        let (x, y) = at(f64::to_radians(angle), rings * ring * 1.12);
-        let _ = writeln!(svg, "<text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"middle\">{name}</text>");
-    }
-    let curve = |points: &mut dyn Iterator<Item = (f64, f64)>| {
-        let text: Vec<String> = points
-            .map(|(angle, radius)| {
-                let (x, y) = at(angle, radius);
-                format!("{x:.1},{y:.1}")
-            })
-            .collect();
-        text.join(" ")
-    };
-    let mut drawn: Vec<(&str, &str)> = Vec::new();
-    for limit in limits {
-        if drawn.contains(&(&limit.controller, &limit.link)) {
-            continue;
-        }
-        let colour = COLOURS[drawn.len() % COLOURS.len()];
-        let same = || limits.iter().filter(|l| l.controller == limit.controller && l.link == limit.link);
-        if drawn.is_empty() {
-            let points = curve(&mut same().map(|l| (l.angle_rad, l.capture_limit_ns)));
-            let _ = writeln!(
-                svg,
-                "<polygon points=\"{points}\" fill=\"none\" stroke=\"#777\" stroke-dasharray=\"5 4\"/>\
-                 <text x=\"16\" y=\"44\" fill=\"#777\">- - capture limit</text>"
-            );
-        }
-        let points = curve(&mut same().map(|l| (l.angle_rad, l.least_ns)));
-        let _ = writeln!(
-            svg,
-            "<polygon points=\"{points}\" fill=\"{colour}\" fill-opacity=\"0.12\" stroke=\"{colour}\" \
-             stroke-width=\"2\"/><text x=\"16\" y=\"{}\" fill=\"{colour}\">{} at {}</text>",
-            64 + 20 * drawn.len(),
-            limit.controller,
-            limit.link
-        );
-        drawn.push((&limit.controller, &limit.link));
-    }
-    svg.push_str("</svg>\n");
-    svg
 }
 
 #[cfg(test)]
@@ -483,23 +464,59 @@ mod tests {
         assert!((diagonal - 0.04 * 2.0_f64.sqrt()).abs() < 1e-12);
     }
 
+    fn arguments(seeds: u64) -> PushMapArguments {
+        use clap::Parser;
+        #[derive(Parser)]
+        struct Line {
+            #[command(flatten)]
+            arguments: PushMapArguments,
+        }
+        let mut arguments = Line::parse_from(["push-map"]).arguments;
+        assert_eq!(arguments.seeds, 6, "the default");
+        arguments.seeds = seeds;
+        arguments
+    }
+
+    /// Seed 0 falls from 40 on and, as survival is not monotone, between 35 and 37 too; seed 1 from 50 on.
     #[test]
-    fn the_least_of_the_seeds_counts() {
+    fn the_limit_is_what_all_seeds_survive_and_nothing_below_it_is_lost() {
+        let fell = |impulse_ns: f64, seed: u64| {
+            let lost = match seed {
+                0 => impulse_ns > 40.0 || (35.0..37.0).contains(&impulse_ns),
+                _ => impulse_ns > 50.0,
+            };
+            Ok(lost.then(|| format!("seed {seed}")))
+        };
+        let stop = StopFlag::never();
+        let both = find(&arguments(2), 30.0, &fell, &stop).unwrap();
+        assert!((34.0..=35.0).contains(&both.limit_ns), "{both:?}");
+        assert_eq!(both.failure.as_deref(), Some("seed 0"));
+        assert_eq!(both.shares, [1.0, 1.0, 1.0], "38 N s are survived again: {both:?}");
+        let second = |impulse_ns: f64, _: u64| fell(impulse_ns, 1);
+        let alone = find(&arguments(1), 30.0, &second, &stop).unwrap();
+        assert!((49.0..=50.0).contains(&alone.limit_ns) && alone.shares == [1.0, 1.0, 0.0], "{alone:?}");
+        let none = find(&arguments(2), 30.0, &|_, _| Ok(Some("fell".to_owned())), &stop).unwrap();
+        assert_eq!((none.limit_ns, none.shares), (0.0, [0.0; 3]));
+    }
+
+    #[test]
+    fn the_map_has_limits_shares_and_reasons() {
         let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(crate::setup::MAIN_SCENARIO);
         let setup = Setup::read(&file, &[]).unwrap();
-        let search = |angle_rad: f64, seed: u64| Search {
-            controller: "mpc".to_owned(),
-            link: "utorso".to_owned(),
-            angle_rad,
-            seed,
-        };
-        let searches = [search(0.0, 1), search(0.0, 2), search(1.0, 1)];
-        let found = vec![(40.0, None), (30.0, Some("the robot fell".to_owned())), (20.0, None)];
-        let limits = gather(&setup, &searches, &found);
-        assert_eq!(limits.len(), 2);
-        assert_eq!((limits[0].least_ns, limits[0].mean_ns, limits[0].most_ns), (30.0, 35.0, 40.0));
-        assert_eq!(limits[0].failure.as_deref(), Some("the robot fell"));
-        assert!(table(&limits).contains("the robot fell") && polar_plot(&limits).contains("polygon"));
+        let search =
+            |angle_rad| Search { controller: "mpc".to_owned(), link: "utorso".to_owned(), angle_rad };
+        let found = Found { limit_ns: 30.0, shares: [1.0, 1.0, 0.5], failure: Some("it fell".to_owned()) };
+        let limits = gather(&setup, 6, &[search(0.0), search(1.0)], vec![found, Found::default()]);
+        let json = serde_json::to_value(&limits).unwrap();
+        assert_eq!((&json[0]["least_ns"], &json[0]["seeds"]), (&30.0.into(), &6.into()));
+        assert_eq!(
+            (&json[0]["share_at_90_percent"], &json[0]["share_at_110_percent"]),
+            (&1.0.into(), &0.5.into())
+        );
+        assert!((limits[0].ratio - 30.0 / limits[0].capture_limit_ns).abs() < 1e-12);
+        let table = table(&limits);
+        assert!(table.contains("it fell") && table.contains("1.00  1.00  0.50"), "{table}");
+        assert!(polar_plot(&limits).contains("polygon"));
     }
 
     /// Figures of the design: lateral 33.1, sagittal 67.1.

@@ -275,6 +275,10 @@ fn body_contacts(setup: &Setup) -> Vec<ContactPoint> {
     points
 }
 
+/// A joint's mechanical stop is this far beyond the range its motor is allowed, rad (m): a controller that keeps the range to some
+/// thousandths must not be hit by the stop, and builders leave such a margin.
+const STOP_BEYOND_RAD: f64 = 0.05;
+
 fn config(setup: &Setup, holding: &Holding, start: &Start) -> Result<PlantConfig, Failure> {
     let Setup { robot, scenario, .. } = setup;
     let plant = &scenario.plant;
@@ -297,6 +301,11 @@ fn config(setup: &Setup, holding: &Holding, start: &Start) -> Result<PlantConfig
             delay: plant.actuator_delay_s,
             ..ActuatorConfig::default()
         },
+        joint_ranges: robot
+            .limits
+            .iter()
+            .map(|limit| [limit.lower - STOP_BEYOND_RAD, limit.upper + STOP_BEYOND_RAD])
+            .collect(),
         terrain: terrain(scenario),
         contact: ContactOptions { ground: ground(setup), ..ContactOptions::default() },
         sensors: sensors(setup)?,

@@ -9,6 +9,7 @@ use delmpc::one_process::{Simulated, simulate};
 use delmpc::setup::{MAIN_SCENARIO, Setup};
 use delmpc::summary::Summary;
 use delmpc_controller_process::stop::StopFlag;
+use nalgebra::{Rotation3, Vector3};
 
 fn run(overrides: &[String]) -> Summary {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(MAIN_SCENARIO);
@@ -43,6 +44,34 @@ fn slope(degrees: f64, eighth: u32) -> String {
     format!("plant.slope_rad=[{:.6}, {:.6}]", size * towards.cos(), size * towards.sin())
 }
 
+/// What makes the robot upright on a slope with its sole flat on it: the base turned back, roll and pitch of the ankle turned along.
+fn balanced_on(degrees: f64, eighth: u32) -> Vec<String> {
+    let (size, towards) = (degrees.to_radians(), std::f64::consts::FRAC_PI_4 * f64::from(eighth));
+    let turn = Rotation3::new(Vector3::new(size * towards.cos(), size * towards.sin(), 0.0));
+    let (roll, pitch, yaw) = turn.inverse().euler_angles();
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(MAIN_SCENARIO);
+    let setup = Setup::read(&file, &[]).unwrap();
+    let posture = setup.robot.posture("one_foot_right").unwrap();
+    let angle = |name: &str| posture.q[setup.robot.joint(name).unwrap()];
+    let (ankle_roll, ankle_pitch) = (angle("r_leg_akx"), angle("r_leg_aky"));
+    // The normal of the sole as the shank has to see it.
+    let normal = Rotation3::from_axis_angle(&Vector3::y_axis(), ankle_pitch)
+        * Rotation3::from_axis_angle(&Vector3::x_axis(), ankle_roll)
+        * turn
+        * Vector3::z();
+    let (to_roll, to_pitch) = (-normal.y.asin(), normal.x.atan2(normal.z));
+    vec![
+        slope(degrees, eighth),
+        format!("robot.start.roll_rad={roll}"),
+        format!("robot.start.pitch_rad={pitch}"),
+        format!("robot.start.yaw_rad={yaw}"),
+        // Turned about the ankle, 76 mm above it, the sole goes up a little.
+        format!("robot.start.height_m={}", 0.076 * (1.0 - size.cos())),
+        format!("robot.start.joint_offset.r_leg_akx={}", to_roll - ankle_roll),
+        format!("robot.start.joint_offset.r_leg_aky={}", to_pitch - ankle_pitch),
+    ]
+}
+
 /// Two and a half seconds: the reach, and a push right after.
 fn short() -> Vec<String> {
     ["duration_s=4.0", "reach.start_s=0.6", "reach.hold_s=0.2", "reach.return_s=0.6", "push.start_s=2.8"]
@@ -59,10 +88,8 @@ fn with(change: &str) -> Vec<String> {
 
 #[test]
 fn it_stands_on_a_slope_and_on_ground_that_gives() {
-    let mut on_slope = with(&slope(3.0, 6));
-    on_slope.push("success.hand_error_hold_max_m=0.06".to_owned());
-    on_slope.push("success.hand_error_at_deadline_m=0.06".to_owned());
-    stands(&on_slope);
+    // Downhill to the right, where the real sole's edge is nearest: the hand is at the ball all the same.
+    succeeds(&with(&slope(4.0, 0)));
     stands(&with("plant.ground_sink_m=0.7e-3"));
     stands(&with("plant.ground_sink_m=2.5e-3"));
 }
@@ -87,10 +114,11 @@ fn the_estimate_is_good_with_a_biased_gyroscope_and_a_biased_attitude_is_survive
 #[test]
 #[ignore = "minutes"]
 fn slopes_sinks_and_starts_of_the_whole_scenario() {
-    for degrees in [1.0, 2.0, 3.0] {
-        for eighth in 0..8 {
+    for eighth in 0..8 {
+        for degrees in [1.0, 2.0, 3.0, 4.0] {
             succeeds(&[slope(degrees, eighth)]);
         }
+        succeeds(&balanced_on(5.0, eighth));
     }
     for mm in [0.05, 0.1, 0.3, 0.7, 1.3, 2.5] {
         succeeds(&[format!("plant.ground_sink_m={mm}e-3")]);
@@ -102,6 +130,21 @@ fn slopes_sinks_and_starts_of_the_whole_scenario() {
         for (key, sign) in [("roll", 1.0), ("roll", -1.0), ("pitch", 1.0), ("pitch", -1.0)] {
             stands(&[format!("robot.start.{key}_rad={}", sign * degrees.to_radians())]);
         }
+    }
+}
+
+/// 95 % of 48 N·s to the left with the seeds that fell when joints at their limits took the rows of torque and pressure point.
+#[test]
+fn it_takes_a_push_that_brings_its_joints_to_their_limits() {
+    for (seed, mm) in [(6, 0.0), (4, 0.3)] {
+        stands(&[
+            "reach.start_s=100".to_owned(),
+            "push.start_s=0.5".to_owned(),
+            "push.impulse_ns=45.6".to_owned(),
+            "duration_s=3.5".to_owned(),
+            format!("plant.ground_sink_m={mm}e-3"),
+            format!("seed={seed}"),
+        ]);
     }
 }
 

@@ -9,7 +9,7 @@
 //! ```
 //!
 //! Reading order: [`plant`], [`contact_step`], [`contact_law`], [`friction_cone`], [`cone_program`], [`terrain`], [`monitor`],
-//! [`servo`], [`watchdog_gains`], [`actuators`], [`sensors`], [`inertial_unit`], [`disturbances`].
+//! [`servo`], [`watchdog_gains`], [`actuators`], [`joint_stops`], [`sensors`], [`inertial_unit`], [`disturbances`].
 //!
 //! Allocation: none in a warm [`plant::Plant::step`], except what Clarabel takes when a cone program is solved (measured in
 //! `tests/allocation.rs`); at rest none is.
@@ -44,6 +44,7 @@ pub mod disturbances;
 pub mod error;
 pub mod friction_cone;
 pub mod inertial_unit;
+pub mod joint_stops;
 pub mod monitor;
 pub mod plant;
 pub mod random;
@@ -63,6 +64,7 @@ pub mod prelude {
     pub use crate::disturbances::{ModelErrors, Push};
     pub use crate::error::PlantError;
     pub use crate::inertial_unit::{InertialReading, InertialUnitConfig};
+    pub use crate::joint_stops::JointStops;
     pub use crate::monitor::{FallCause, Foot, FootReport, Monitor, MonitorConfig, Totals};
     pub use crate::plant::{Plant, PlantConfig, PlantModel, PlantStep};
     pub use crate::sensors::{Readings, SensorConfig};

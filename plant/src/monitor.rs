@@ -143,6 +143,8 @@ pub struct Totals {
     pub unconverged_steps: u64,
     /// Work of the joint torques, J.
     pub torque_work: f64,
+    /// Work of the joint stops, J.
+    pub stop_work: f64,
     /// Work of the pushes, J.
     pub push_work: f64,
     /// Work of the contacts (negative: friction and impacts), J.
@@ -162,7 +164,7 @@ pub struct Totals {
 impl Totals {
     /// Change of the energy that no work explains, J.
     pub fn energy_balance_error(&self) -> f64 {
-        let work = self.torque_work + self.push_work + self.contact_work - self.damping_loss;
+        let work = self.torque_work + self.stop_work + self.push_work + self.contact_work - self.damping_loss;
         self.energy - self.start_energy - work
     }
 }
@@ -172,6 +174,8 @@ impl Totals {
 pub struct StepWork {
     /// Of the joint torques.
     pub torque: f64,
+    /// Of the joint stops.
+    pub stop: f64,
     /// Of the pushes.
     pub push: f64,
     /// Of the contact forces.
@@ -242,6 +246,7 @@ impl Monitor {
                 max_penetration: 0.0,
                 unconverged_steps: 0,
                 torque_work: 0.0,
+                stop_work: 0.0,
                 push_work: 0.0,
                 contact_work: 0.0,
                 damping_loss: 0.0,
@@ -375,14 +380,16 @@ impl Monitor {
 
     fn update_energy(&mut self, energy: f64, work: &StepWork) {
         let totals = &mut self.totals;
-        let done = work.torque + work.push - work.damping;
+        let done = work.torque + work.stop + work.push - work.damping;
         totals.max_energy_gain = totals.max_energy_gain.max(energy - totals.energy - done);
         totals.energy = energy;
         totals.torque_work += work.torque;
+        totals.stop_work += work.stop;
         totals.push_work += work.push;
         totals.contact_work += work.contact;
         totals.damping_loss += work.damping;
-        totals.energy_moved += work.torque.abs() + work.push.abs() + work.contact.abs() + work.damping.abs();
+        let moved = [work.torque, work.stop, work.push, work.contact, work.damping];
+        totals.energy_moved += moved.iter().map(|work| work.abs()).sum::<f64>();
     }
 }
 

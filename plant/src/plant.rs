@@ -18,6 +18,7 @@ use crate::contact_step::{ContactOptions, ContactPoint, ContactReport, ContactSt
 use crate::disturbances::{ModelErrors, Push};
 use crate::error::{PlantError, require, require_length};
 use crate::inertial_unit::InertialUnit;
+use crate::joint_stops::JointStops;
 use crate::monitor::{Foot, Monitor, MonitorConfig, StepWork};
 use crate::sensors::{Readings, SensorConfig, Sensors};
 use crate::servo::{CommandRefused, Servo, WatchdogConfig};
@@ -50,6 +51,8 @@ pub struct PlantConfig {
     pub errors: ModelErrors,
     /// Actuators.
     pub actuators: ActuatorConfig,
+    /// Ranges of the joints, at whose ends they meet a stop (rad or m; infinite: none); empty: no stops.
+    pub joint_ranges: Vec<[f64; 2]>,
     /// Sensors.
     pub sensors: SensorConfig,
     /// Pushes.
@@ -70,6 +73,7 @@ impl Default for PlantConfig {
             contact: ContactOptions::default(),
             errors: ModelErrors::default(),
             actuators: ActuatorConfig::default(),
+            joint_ranges: Vec::new(),
             sensors: SensorConfig::PERFECT,
             pushes: Vec::new(),
             watchdog: WatchdogConfig::default(),
@@ -102,6 +106,9 @@ pub struct Plant {
     contact: ContactStep,
     servo: Servo,
     actuators: Actuators,
+    stops: JointStops,
+    /// Torques of actuators and stops in this step.
+    torque: Vec<f64>,
     sensors: Sensors,
     inertial_unit: InertialUnit,
     foot_readings: [FootReading; MAX_FEET],
@@ -157,6 +164,8 @@ impl Plant {
             contact,
             servo: Servo::new(joints, model.joint_set_hash, config.watchdog.clone())?,
             actuators: Actuators::new(joints, dt, &config.actuators)?,
+            stops: JointStops::new(&tree, state, dt, &config.joint_ranges)?,
+            torque: vec![0.0; joints],
             sensors: Sensors::new(joints, model.feet.len(), dt, &config.sensors, config.seed)?,
             inertial_unit: InertialUnit::new(unit, config.sensors.noise_scale, config.seed),
             foot_readings: [FootReading { flags: 0, reserved: 0, torque_s: [0.0; 3], force_s: [0.0; 3] };
@@ -244,8 +253,11 @@ impl Plant {
         self.acting.extend(self.pushes.iter().filter_map(|push| push.point_force(&self.tree, time, dt)));
         self.acting.extend(self.pull);
 
-        let torque = self.actuators.torque();
-        let solved = self.contact.solve(&self.tree, &self.state, torque, &self.acting);
+        let stops = self.stops.update(&self.state.q, &self.velocity[base..]);
+        for ((torque, motor), stop) in self.torque.iter_mut().zip(self.actuators.torque()).zip(stops) {
+            *torque = motor + stop;
+        }
+        let solved = self.contact.solve(&self.tree, &self.state, &self.torque, &self.acting);
         let contact = solved.map_err(|cause| {
             self.monitor.count_failure(time);
             PlantError::Step { time, cause }
@@ -293,7 +305,9 @@ impl Plant {
         let (next, del) = (self.contact.next_state(), self.contact.del());
         let dt = self.contact.time_step();
         for (joint, torque) in self.actuators.torque().iter().enumerate() {
-            work.torque += torque * (next.q[joint] - self.state.q[joint]);
+            let way = next.q[joint] - self.state.q[joint];
+            work.torque += torque * way;
+            work.stop += self.stops.torque()[joint] * way;
         }
         for push in &self.acting {
             let place = |alpha: usize| del.body_pose(push.body, alpha).transform_point(&push.point_b);

@@ -91,6 +91,42 @@ fn without_torque_the_robot_falls() {
     assert!(message.has_status(status::FELL));
 }
 
+/// The largest angle a joint is beyond its range in three seconds without torque, rad; largest error of the energy balance, J.
+fn beyond_the_range(robot: &delmpc_robots::RobotModel, joint_ranges: Vec<[f64; 2]>) -> (f64, f64) {
+    let model = atlas::model(robot, 0.8);
+    let state = atlas::posture(robot, "double_support");
+    let config =
+        PlantConfig { joint_ranges, watchdog: WatchdogConfig::zero_torque(), ..PlantConfig::default() };
+    let mut plant = Plant::new(&model, &config, &state).unwrap();
+    let (mut beyond, mut worst) = (0.0, (0, 0));
+    for step in 0..3000 {
+        plant.step().unwrap();
+        for (joint, (q, limit)) in plant.state().q.iter().zip(&robot.limits).enumerate() {
+            let now = (q - limit.upper).max(limit.lower - q);
+            if now > beyond {
+                (beyond, worst) = (now, (joint, step));
+            }
+        }
+    }
+    println!("{} at {} ms", robot.joint_names[worst.0], worst.1);
+    let totals = plant.monitor().totals();
+    println!("{beyond:.3} rad, balance {:.1e} J, {totals:?}", totals.energy_balance_error());
+    assert!(totals.fall.is_some());
+    (beyond, totals.energy_balance_error().abs() / totals.energy_moved)
+}
+
+#[test]
+fn a_fallen_robot_does_not_bend_beyond_its_stops() {
+    let robot = atlas::load();
+    let ranges = robot.limits.iter().map(|limit| [limit.lower, limit.upper]).collect();
+    let (free, _) = beyond_the_range(&robot, Vec::new());
+    let (stopped, balance) = beyond_the_range(&robot, ranges);
+    assert!(free > 0.5, "nothing to stop: {free}");
+    // The ankle of the foot that the whole robot falls on; all others stay within some hundredths.
+    assert!(stopped < 0.25, "{stopped}");
+    assert!(balance < 1e-3, "{balance}");
+}
+
 fn push(robot: &delmpc_robots::RobotModel, impulse: f64) -> Push {
     let torso = robot.link("utorso").unwrap();
     Push {

@@ -59,6 +59,10 @@ const OLDER_STATES: u32 = 5;
 
 /// A violation beyond this part of a constraint's scale is reported as [`Verdict::Infeasible`].
 const GAVE_WAY: f64 = 1e-3;
+/// Torques and contact forces of a plan may be beyond their limits by this part of their scale in the stages a command covers ...
+const UNMET_NEAR: f64 = 0.05;
+/// ... and by this later, where there is time for a better plan.
+const UNMET_FAR: f64 = 0.5;
 /// A plan that moves a node by more than this (rad, m) is not believed.
 const LARGEST_MOVE: f64 = 2.0;
 /// How much later than the nominal's start a state may be, in horizons: what comes after the cycle that was held up is fresh again.
@@ -200,7 +204,7 @@ impl Controller {
             estimator: Estimator::new(&model)?,
             unloaded_leg,
             ladder: FallbackLadder::new(config.fallback),
-            reference: Reference { home, reach: None, com_shift: Vector3::zeros() },
+            reference: Reference::at(home),
             asked_reach: None,
             hand_distance_left_m: 0.0,
             trim: BalanceTrim::new(config.trim_s),
@@ -312,9 +316,9 @@ impl Controller {
         self.command.report.riccati_ns = prepared.riccati_ns;
         let solved = self.solve_constrained();
         self.command.report.qp_ns = watch.lap();
-        let report = solved?;
+        self.report_constraints(&solved?);
+        self.check_followable()?;
         self.adopt_plan()?;
-        self.report_constraints(&report);
         Ok(())
     }
 
@@ -346,6 +350,7 @@ impl Controller {
     fn prepare_for(&mut self, start_s: f64, watch: &mut StopWatch<'_>) -> Result<Preparation, u32> {
         self.shift_nominal(start_s);
         let shift_ns = watch.lap();
+        self.horizon.place_sole(&self.estimator.estimate().sole_pose);
         self.horizon
             .linearise(&self.model, &self.config, &self.reference, &self.nominal)
             .map_err(|_| reason::STAGE)?;
@@ -388,13 +393,14 @@ impl Controller {
         self.force_change += FORCE_SMOOTHING * (change - self.force_change);
 
         let measured_s = self.run_time_s(state.time_ns);
-        self.reference.com_shift = Vector3::zeros();
+        let sole_pose = self.estimator.estimate().sole_pose;
+        self.reference.stand_on(&sole_pose, &Vector3::zeros());
         self.reference.sample(measured_s, &mut self.targets);
         if let Some(wrench) = wrench {
             let rates = &self.estimator.estimate().q_dot;
             self.trim.update(&self.targets.com, &wrench.torque, &wrench.force, rates, since_last_s);
         }
-        self.reference.com_shift = self.trim.shift();
+        self.reference.stand_on(&sole_pose, &self.trim.shift());
         self.test_innovation(measured_s);
         let Estimate { q, q_dot, .. } = self.estimator.estimate();
         self.predicted[..n].copy_from_slice(q);
@@ -487,6 +493,16 @@ impl Controller {
         let problem = &self.horizon.problem;
         let solved = self.qp.solve(problem, &self.riccati, self.backend.as_mut(), &mut self.solution);
         solved.map_err(|_| reason::QP)
+    }
+
+    /// A solution that leaves torque limits or contact rows out is none: sent to the robot, it would throw it.
+    fn check_followable(&self) -> Result<(), u32> {
+        let offsets = self.nominal.offsets();
+        let followable = (0..self.solution.stages()).all(|k| {
+            let allowed = if offsets[k] < self.config.command_life_s { UNMET_NEAR } else { UNMET_FAR };
+            self.qp.unmet(k) <= allowed
+        });
+        if followable { Ok(()) } else { Err(reason::QP) }
     }
 
     /// The solution becomes the plan, unless it is out of reach of the linearisation.

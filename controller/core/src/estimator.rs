@@ -12,7 +12,7 @@ use delmpc_estimation::prelude::{
     Measurement,
 };
 use delmpc_mechanics::errors::ModelError;
-use delmpc_mechanics::spatial::{RigidTransform, Twist, Wrench};
+use delmpc_mechanics::spatial::{RigidTransform, Twist, Wrench, exp_rotation, log_rotation};
 use delmpc_messages::{Command, MAX_FEET, PlantState, foot, sensor};
 use nalgebra::{Quaternion, UnitQuaternion, Vector2, Vector3};
 
@@ -37,12 +37,14 @@ pub struct Estimate {
     pub slip_m: f64,
     /// How far it has tilted from where it first was, rad.
     pub tilt_rad: f64,
-    /// Wrench of the ground on the stance foot about the sole's origin, in the level {0}; `None`: not measured.
+    /// Wrench of the ground on the stance foot about the origin of the level {0}, in its axes; `None`: not measured.
     pub stance_wrench: Option<Wrench>,
     /// Whether the stance foot carries load.
     pub stance_loaded: bool,
     /// Encoders of the ankle joints less those of the level foot, as they are when the foot lies on the ground, rad.
     pub ground_lean: Vector2<f64>,
+    /// Pose of the sole in the level {0}, as it is when the foot lies on the ground: identity on level ground.
+    pub sole_pose: RigidTransform,
 }
 
 /// Workspace of the estimator.
@@ -84,6 +86,7 @@ impl Estimator {
                 stance_wrench: None,
                 stance_loaded: true,
                 ground_lean: Vector2::zeros(),
+                sole_pose: RigidTransform::identity(),
             },
             base,
             level,
@@ -150,8 +153,7 @@ impl Estimator {
         let Estimate { q, q_dot, stance_wrench, .. } = &mut self.estimate;
         self.levelled = level.level(&model.tree, &up, &rate, q, q_dot)?;
         if let Some(wrench) = stance_wrench.as_mut().filter(|_| self.levelled) {
-            let turn = level.sole_rotation();
-            *wrench = Wrench::new(turn * wrench.torque, turn * wrench.force);
+            *wrench = level.sole_pose().transform_wrench(wrench);
         }
         Ok(())
     }
@@ -170,10 +172,11 @@ impl Estimator {
         estimate.stance_loaded = foot.loaded || estimate.stance_wrench.is_none();
         if let Some(level) = self.level.as_ref().filter(|_| self.levelled) {
             match self.last_s {
-                None => estimate.ground_lean = level.lean(),
+                None => (estimate.ground_lean, estimate.sole_pose) = (level.lean(), *level.sole_pose()),
                 Some(last_s) if foot.loaded && foot.margin > FIRM_MARGIN_M => {
                     let share = ((time_s - last_s) / GROUND_LEAN_S).clamp(0.0, 1.0);
                     estimate.ground_lean += (level.lean() - estimate.ground_lean) * share;
+                    estimate.sole_pose = between(&estimate.sole_pose, level.sole_pose(), share);
                 }
                 Some(_) => {}
             }
@@ -222,6 +225,15 @@ impl Estimator {
     /// The levelled stance foot, when the law is told by the gyroscope.
     pub(crate) fn told_by_gyroscope(&self) -> Option<&LevelStance> {
         self.level.as_ref().filter(|_| self.levelled && self.imu_angle.is_some())
+    }
+}
+
+/// A `share` of the way from one pose to another one near it.
+fn between(from: &RigidTransform, to: &RigidTransform, share: f64) -> RigidTransform {
+    let turn = log_rotation(&(to.rotation * from.rotation.transpose())) * share;
+    RigidTransform {
+        rotation: exp_rotation(&turn) * from.rotation,
+        translation: from.translation + (to.translation - from.translation) * share,
     }
 }
 

@@ -15,13 +15,14 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use delmpc_mechanics::errors::StepError;
+use delmpc_mechanics::spatial::RigidTransform;
 use delmpc_mechanics::tree::KinematicTree;
 use delmpc_messages::ConstraintKind;
 use faer::{Accum, Mat};
 use nalgebra::Vector3;
 
 use crate::config::ControllerConfig;
-use crate::contact_wrench::StageWrench;
+use crate::contact_wrench::{SoleCone, StageWrench};
 use crate::errors::ControlError;
 use crate::horizon_dynamics::HorizonDynamics;
 use crate::model::ControllerModel;
@@ -43,6 +44,7 @@ pub(crate) struct HorizonProblem {
     dynamics: HorizonDynamics,
     nodes: Vec<NodeKinematics>,
     wrench: Option<StageWrench>,
+    cone: Option<SoleCone>,
     tasks: Tasks,
     targets: TaskTargets,
     torque_weight: Vec<f64>,
@@ -100,6 +102,7 @@ impl HorizonProblem {
             dynamics: HorizonDynamics::new(tree, lengths.len())?,
             nodes: vec![NodeKinematics::new(tree); lengths.len() + 1],
             wrench: cone.map(|_| StageWrench::new(n)),
+            cone: cone.map(SoleCone::new),
             tasks: Tasks::new(n, config.weights.clone(), model.hand, model.swing_foot),
             targets: TaskTargets::new(n),
             torque_weight,
@@ -108,6 +111,13 @@ impl HorizonProblem {
             problem,
             lengths,
         })
+    }
+
+    /// Says where the stance sole is in {0}, from the next [`Self::linearise`] on.
+    pub fn place_sole(&mut self, sole_pose: &RigidTransform) {
+        if let Some(cone) = &self.cone {
+            cone.place(sole_pose, &mut self.problem.output_rows);
+        }
     }
 
     /// Fills the problem around the nominal.

@@ -12,12 +12,18 @@
 //! | `a_j` | axes of the joints between foot and that link, in {0}; `a`: those of the two ankle joints, `r`: the others |
 //! | `M` | inverse of the horizontal part of the ankle's axes, `[a_a]_xy⁻¹` |
 //! | `Θ` | angle summed up by the gyroscope |
+//! | `X(q)` | pose of that link in {0} |
+//! | `S` | pose of the real sole in {0} |
 //!
 //! ```text
 //! R(q_a, q_r) z_i = e_z                                   solved for q_a by Newton's method, ∂/∂q_j = a_j × e_z
 //! Σ_a [a_a]_xy q̇_a = [R ω]_xy - Σ_r [a_r]_xy q̇_r
 //! δq_a = M ( [R δΘ]_xy - Σ_r [a_r]_xy δq_r )               so K_a δq_a becomes a gain on Θ and on the other joints
 //! ```
+//!
+//! The real sole is where the encoders have it relative to that link, `S = X(q levelled) X(q read)⁻¹`: turned about the ankle, so downhill
+//! of the levelled one (1.3 mm a degree for an ankle 76 mm above it), and turned in heading where the ankle's axes are not level. Its
+//! corners and its normal make the wrench cone ([`crate::contact_wrench::SoleCone`]), its heading the direction of goals.
 //!
 //! The law of a command is told in these terms ([`LevelStance::write`]): between two commands the servo feels the robot lean by the
 //! gyroscope, and an ankle's chatter is not taken for a push.
@@ -29,7 +35,7 @@ use alloc::vec::Vec;
 
 use delmpc_mechanics::errors::ModelError;
 use delmpc_mechanics::kinematics::{Configuration, Kinematics};
-use delmpc_mechanics::spatial::log_rotation;
+use delmpc_mechanics::spatial::{RigidTransform, log_rotation};
 use delmpc_mechanics::tree::{JointKind, KinematicTree};
 use delmpc_messages::{Command, MAX_JOINTS};
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
@@ -60,8 +66,8 @@ pub(crate) struct LevelStance {
     inverse: Matrix2<f64>,
     /// `R` at the levelled state.
     rotation: Matrix3<f64>,
-    /// Axes of the real sole in {0}.
-    sole_rotation: Matrix3<f64>,
+    /// Where the real sole is in {0}, when what it carries is where the levelled foot has it.
+    sole_pose: RigidTransform,
     /// By how much the encoders of the ankle differ from the levelled state: what the foot leans.
     lean: Vector2<f64>,
     /// The same of their rates.
@@ -98,7 +104,7 @@ impl LevelStance {
             axes: vec![Vector3::zeros(); tree.dof()],
             inverse: Matrix2::identity(),
             rotation: Matrix3::identity(),
-            sole_rotation: Matrix3::identity(),
+            sole_pose: RigidTransform::identity(),
             lean: Vector2::zeros(),
             lean_rate: Vector2::zeros(),
             later: vec![0.0; 2 * tree.dof()],
@@ -111,9 +117,10 @@ impl LevelStance {
         self.ankle
     }
 
-    /// Axes of the real sole in the level {0}.
-    pub fn sole_rotation(&self) -> &Matrix3<f64> {
-        &self.sole_rotation
+    /// Pose of the real sole in the level {0}: turned about the ankle, so that it is not only tilted but also lies some millimetres
+    /// downhill of the levelled one.
+    pub fn sole_pose(&self) -> &RigidTransform {
+        &self.sole_pose
     }
 
     /// Encoders of the ankle less their levelled values, rad.
@@ -137,7 +144,7 @@ impl LevelStance {
         let [first, second] = self.ankle;
         let encoders = Vector2::new(q[first], q[second]);
         self.kinematics.update_positions(tree, &Configuration::fixed(q))?;
-        let read = self.kinematics.link_poses_w()[self.body].rotation;
+        let read = self.kinematics.link_poses_w()[self.body];
         let mut converged = false;
         for _ in 0..ITERATIONS {
             self.take_axes();
@@ -159,7 +166,7 @@ impl LevelStance {
             (q[first], q[second]) = (encoders.x, encoders.y);
             self.kinematics.update_positions(tree, &Configuration::fixed(q))?;
             self.take_axes();
-            self.sole_rotation = Matrix3::identity();
+            self.sole_pose = RigidTransform::identity();
             self.lean = Vector2::zeros();
             self.lean_rate = Vector2::zeros();
             return Ok(false);
@@ -171,7 +178,7 @@ impl LevelStance {
         let ankle = self.inverse * turning;
         self.lean_rate = Vector2::new(q_dot[first], q_dot[second]) - ankle;
         (q_dot[first], q_dot[second]) = (ankle.x, ankle.y);
-        self.sole_rotation = self.rotation * read.transpose();
+        self.sole_pose = self.kinematics.link_poses_w()[self.body] * read.inverse();
         self.lean = encoders - Vector2::new(q[first], q[second]);
         Ok(true)
     }

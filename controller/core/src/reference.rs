@@ -13,6 +13,7 @@
 
 use alloc::vec::Vec;
 
+use delmpc_mechanics::spatial::{RigidTransform, exp_rotation};
 use nalgebra::{Matrix3, Vector3};
 
 use crate::tasks::TaskTargets;
@@ -84,9 +85,28 @@ pub struct Reference {
     pub reach: Option<(Reach, PostureGoal)>,
     /// By how much the mass centre is to be elsewhere than the model says, in {0}, m.
     pub com_shift: Vector3<f64>,
+    /// By how much the ball is elsewhere in {0} than the reach has it, m.
+    pub ball_shift: Vector3<f64>,
 }
 
 impl Reference {
+    /// Reference at rest at `home`, as the model has it.
+    pub fn at(home: PostureGoal) -> Self {
+        Self { home, reach: None, com_shift: Vector3::zeros(), ball_shift: Vector3::zeros() }
+    }
+
+    /// Says where the real sole is in {0} and how the mass centre is trimmed there. A ball is given from the middle of the real sole
+    /// with its heading, z up, and the mass centre belongs over it.
+    pub fn stand_on(&mut self, sole_pose: &RigidTransform, trim: &Vector3<f64>) {
+        let middle = &sole_pose.translation;
+        self.com_shift = trim + Vector3::new(middle.x, middle.y, 0.0);
+        if let Some((reach, _)) = &self.reach {
+            let ball = Vector3::from(reach.ball_m);
+            let heading = libm::atan2(sole_pose.rotation[(1, 0)], sole_pose.rotation[(0, 0)]);
+            self.ball_shift = middle + exp_rotation(&Vector3::new(0.0, 0.0, heading)) * ball - ball;
+        }
+    }
+
     /// Fills the targets for a time of the run (s).
     pub fn sample(&self, time_s: f64, targets: &mut TaskTargets) {
         let home = &self.home;
@@ -107,7 +127,7 @@ impl Reference {
         }
         targets.com = home.com + (goal.com - home.com) * s + self.com_shift;
         targets.com_velocity = (goal.com - home.com) * rate;
-        let way = Vector3::from(reach.ball_m) - home.hand;
+        let way = Vector3::from(reach.ball_m) + self.ball_shift - home.hand;
         targets.hand = home.hand + way * s;
         targets.hand_velocity = way * rate;
         targets.hand_activity = activity;

@@ -84,6 +84,28 @@ fn a_time_that_ran_ahead_is_forgotten_and_times_at_the_end_of_all_numbers_are_re
     }
 }
 
+/// A robot in a motion that no torque within the limits can lead back, and a dual with room for two rows: what comes out is not sent.
+#[test]
+fn a_plan_beyond_torque_limits_and_contact_rows_is_no_solution() {
+    let atlas = atlas();
+    let plant = &mut WeldedPlant::new(&atlas);
+    let mut config = ControllerConfig::default();
+    config.qp.capacity = 2;
+    let mut controller = Controller::new(atlas.controller_model(), config).unwrap();
+    let mut state = plant.measure();
+    state.time_ns = PERIOD_NS;
+    assert_eq!(controller.cycle(&state, state.time_ns, &StoppedClock).reason, 0);
+    state.time_ns = 2 * PERIOD_NS;
+    for &joint in &plant.model.message_joint {
+        state.velocity[joint] += 1.5;
+    }
+    let command = controller.cycle(&state, state.time_ns, &StoppedClock);
+    assert!(command.report.dropped_rows > 0, "{:?}", command.report);
+    assert_eq!(command.reason, reason::QP);
+    assert_eq!(command.fallback_level(), Some(FallbackLevel::ShiftedPlan));
+    assert_eq!(command.verdict(), Some(Verdict::Infeasible));
+}
+
 #[test]
 fn garbage_gives_finite_commands() {
     let atlas = atlas();

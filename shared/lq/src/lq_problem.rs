@@ -145,6 +145,11 @@ impl LqProblem {
         }
     }
 
+    /// Whether a row is a bound of a state, which more inputs than those of its own stage decide.
+    pub fn bounds_a_state(&self, row: RowId) -> bool {
+        matches!(self.part(row), RowPart::State { .. })
+    }
+
     /// Adds the coefficients of a row in `z = (u, x)` of its stage to `target` (length `n_u + n_x`), times `factor`.
     pub fn add_row(&self, row: RowId, factor: f64, target: &mut [f64]) {
         match self.part(row) {

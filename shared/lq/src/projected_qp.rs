@@ -29,8 +29,11 @@
 //! **Row generation.** On the LQR trajectory no row violated: it is the optimum, nothing is solved. Otherwise (D) is solved over the
 //! rows that were active at the last solution ([`ProjectedQp::prepare`]), or when there are none over the most violated ones; the
 //! trajectory of `w = -G'y` is checked over the whole horizon, rows newly violated enter, until none is. The optimum over the
-//! rows that entered which violates no other row is the optimum over all. When the room is used up, rows with `y = 0` make
-//! place; if there are none, the remaining violated ones are counted as dropped.
+//! rows that entered which violates no other row is the optimum over all. When the capacity is used up, rows with `y = 0` leave. If
+//! that is not enough, bounds of states leave for bounds of inputs and rows of outputs, never the other way round: a state that rests
+//! on its bound asks for a row at every node, and a trajectory that passes it by a little can be followed; one whose torques or contact
+//! forces are beyond their limits cannot. What is still violated is counted as dropped, and [`ProjectedQp::unmet`] says how far inputs
+//! and outputs of a stage are from what they have to keep.
 //!
 //! **Solving (D).** From one cycle to the next the set of active rows hardly changes. So a few partitions of block pivoting
 //! ([`crate::active_set_dual`]) are tried from the last multipliers: one small Cholesky factorisation each, and where the signs
@@ -82,7 +85,7 @@ pub struct ProjectedQpOptions {
 
 impl Default for ProjectedQpOptions {
     fn default() -> Self {
-        Self { capacity: 64, rows_per_round: 24, max_rounds: 8, tolerance: 1e-9, pivots: 12 }
+        Self { capacity: 128, rows_per_round: 24, max_rounds: 8, tolerance: 1e-9, pivots: 12 }
     }
 }
 
@@ -108,7 +111,7 @@ pub struct ProjectedQpReport {
     pub backend_solves: u32,
     /// Rows with a positive multiplier at the end.
     pub active_rows: u32,
-    /// Violated rows left out because there was no room, or the rounds were over.
+    /// Violated rows left out because there was no capacity for them, or the rounds were over.
     pub dropped_rows: u32,
     /// Solves in which the backend failed and the built-in active-set method answered instead.
     pub backend_failures: u32,
@@ -135,6 +138,12 @@ pub struct ProjectedQp {
     v: Mat<f64>,
     lqr: Trajectory,
     violated: Vec<(f64, RowId)>,
+    /// By stage: the largest relative violation of an input or output row that is hard or not in the dual.
+    unmet: Vec<f64>,
+    /// Rows of the dual that make room.
+    leaving: Vec<bool>,
+    /// Bounds of states had to leave in this solve: no other enters.
+    crowded: bool,
     outputs: Vec<f64>,
     pivoting: ActiveSetDual,
     /// Rows with a positive multiplier at the last solution, and the multiplier in the row's own unit.
@@ -164,6 +173,9 @@ impl ProjectedQp {
             v: Mat::zeros(inputs, stages),
             lqr: Trajectory::new(size),
             violated: Vec::with_capacity(total_rows),
+            unmet: vec![0.0; stages],
+            leaving: vec![false; capacity],
+            crowded: false,
             outputs: vec![0.0; outputs],
             pivoting: ActiveSetDual::new(capacity),
             active: Vec::with_capacity(capacity),
@@ -206,6 +218,7 @@ impl ProjectedQp {
         }
         let warm = self.rows.len();
         self.active.clear();
+        self.crowded = false;
         riccati.rollout(problem, None, trajectory);
         if !trajectory.is_finite() {
             return Err(QpError::NotFinite);
@@ -245,6 +258,12 @@ impl ProjectedQp {
         self.rows.iter().enumerate().map(|(i, row)| (*row, self.y[i] / self.row_norm[i]))
     }
 
+    /// Largest violation, relative to its row's scale, of a hard input or output row of a stage at the last solution, or of a soft one
+    /// that was left out of the dual. Beyond the tolerance the trajectory of that stage is not one the inputs can follow.
+    pub fn unmet(&self, stage: usize) -> f64 {
+        self.unmet.get(stage).copied().unwrap_or(0.0)
+    }
+
     /// Lists the violated rows that are not in the dual, most violated first, and notes the worst violation of all.
     fn find_violated(
         &mut self,
@@ -252,8 +271,9 @@ impl ProjectedQp {
         trajectory: &Trajectory,
         report: &mut ProjectedQpReport,
     ) {
-        let Self { rows, violated, outputs, options, .. } = self;
+        let Self { rows, violated, unmet, outputs, options, .. } = self;
         violated.clear();
+        unmet.fill(0.0);
         report.worst = None;
         let mut worst_relative = 0.0;
         problem.visit_rows(trajectory, options.tolerance, outputs, |row, amount, scale| {
@@ -262,8 +282,15 @@ impl ProjectedQp {
                 worst_relative = relative;
                 report.worst = Some(Violation { row, tag: problem.tag(row), amount });
             }
-            if !rows.contains(&row) && violated.len() < violated.capacity() {
+            let left_out = !rows.contains(&row);
+            if left_out && violated.len() < violated.capacity() {
                 violated.push((relative, row));
+            }
+            if (left_out || problem.tag(row).penalty == f64::INFINITY)
+                && !problem.bounds_a_state(row)
+                && let Some(unmet) = unmet.get_mut(row.stage as usize)
+            {
+                *unmet = unmet.max(relative);
             }
         });
         violated.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
@@ -271,12 +298,20 @@ impl ProjectedQp {
 
     /// Lets the most violated rows into the dual and computes their columns; returns how many.
     fn admit(&mut self, problem: &LqProblem, riccati: &Riccati) -> usize {
+        let late = |row: &RowId| problem.bounds_a_state(*row);
+        if self.crowded {
+            self.violated.retain(|(_, row)| !late(row));
+        }
         let wanted = self.violated.len().min(self.options.rows_per_round);
         if wanted == 0 {
             return 0;
         }
         if self.rows.len() + wanted > self.options.capacity {
-            self.make_room();
+            self.violated.sort_unstable_by(|(a, row), (b, other)| {
+                late(row).cmp(&late(other)).then(b.total_cmp(a)).then(row.cmp(other))
+            });
+            let urgent = self.violated[..wanted].iter().filter(|(_, row)| !late(row)).count();
+            self.make_room(problem, urgent);
         }
         let first = self.rows.len();
         let entered = wanted.min(self.options.capacity - first);
@@ -289,11 +324,43 @@ impl ProjectedQp {
         entered
     }
 
-    /// Removes the rows without a multiplier.
-    fn make_room(&mut self) {
+    /// Removes the bounds of states without a multiplier, and as many rows more as `urgent` ones need: the other rows without a
+    /// multiplier, then bounds of states that are also in the dual one node earlier, then the others, the latest first.
+    fn make_room(&mut self, problem: &LqProblem, urgent: usize) {
+        let Self { rows, y, leaving, options, crowded, .. } = self;
+        let count = rows.len();
+        for i in 0..count {
+            leaving[i] = y[i] <= 0.0 && problem.bounds_a_state(rows[i]);
+        }
+        let mut left = count - leaving[..count].iter().filter(|leaves| **leaves).count();
+        for i in 0..count {
+            if left + urgent > options.capacity && y[i] <= 0.0 && !leaving[i] {
+                leaving[i] = true;
+                left -= 1;
+            }
+        }
+        for alone_too in [false, true] {
+            while left + urgent > options.capacity {
+                let stays = |other: RowId| (0..count).any(|i| rows[i] == other && !leaving[i]);
+                let goes = |i: usize| {
+                    let earlier = RowId { stage: rows[i].stage.wrapping_sub(1), ..rows[i] };
+                    !leaving[i] && problem.bounds_a_state(rows[i]) && (alone_too || stays(earlier))
+                };
+                let Some(i) = (0..count).filter(|i| goes(*i)).max_by_key(|i| rows[*i].stage) else { break };
+                leaving[i] = true;
+                left -= 1;
+                // They would only come back.
+                *crowded = true;
+            }
+        }
+        self.compact();
+    }
+
+    /// Takes the rows that leave out of the dual.
+    fn compact(&mut self) {
         let mut kept = 0;
         for i in 0..self.rows.len() {
-            if self.y[i] <= 0.0 {
+            if self.leaving[i] {
                 continue;
             }
             if kept != i {

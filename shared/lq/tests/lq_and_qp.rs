@@ -182,6 +182,36 @@ fn without_an_active_constraint_the_answer_is_the_lqr_s() {
     assert!((0..SIZE.stages).all(|k| t.u(k) == lqr.u(k)));
 }
 
+/// Joints that rest on their limits ask for a row at every node: more than the dual has room for.
+#[test]
+fn no_bound_of_a_state_takes_the_place_of_an_input_or_an_output() {
+    let options =
+        ProjectedQpOptions { capacity: 24, rows_per_round: 12, max_rounds: 20, ..Default::default() };
+    let limits = Limits { input: 1.5, row: 1.2, state: 0.25, penalty: 100.0 };
+    let mut crowded = 0;
+    for seed in 0..40 {
+        let problem = problem(seed, SIZE, limits);
+        let mut riccati = Riccati::new(SIZE);
+        riccati.factorise(&problem).unwrap();
+        let mut t = Trajectory::new(SIZE);
+        t.x_mut(0).copy_from_slice(&start(seed, SIZE.states, 1.0));
+        let mut qp = ProjectedQp::new(SIZE, options);
+        let report = qp.solve(&problem, &riccati, &mut ActiveSetDual::new(24), &mut t).unwrap();
+        let states = qp.multipliers().filter(|(row, y)| problem.bounds_a_state(*row) && *y > 0.0).count();
+        let unmet = (0..SIZE.stages).map(|k| qp.unmet(k)).fold(0.0, f64::max);
+        if report.dropped_rows > 0 && states > 0 {
+            crowded += 1;
+            assert!(unmet < 1e-6, "seed {seed}: {unmet:e} with {states} rows of states, {report:?}");
+        }
+        // What it says is what the trajectory does.
+        for k in 0..SIZE.stages {
+            let beyond = t.u(k).iter().map(|u| u.abs() - limits.input).fold(0.0, f64::max);
+            assert!(beyond <= qp.unmet(k) * (1.0 + 1e-12) + 1e-9, "seed {seed}, stage {k}: {beyond}");
+        }
+    }
+    assert!(crowded > 10, "problems without room for all: {crowded}");
+}
+
 #[cfg(feature = "clarabel")]
 mod against_the_oracle {
     use super::*;

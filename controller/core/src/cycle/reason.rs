@@ -14,7 +14,7 @@ pub const PREDICTION: u32 = 110;
 pub const STAGE: u32 = 111;
 /// The Riccati recursion broke down.
 pub const RICCATI: u32 = 112;
-/// The constrained QP gave nothing usable.
+/// The constrained QP gave nothing usable: no finite numbers, or torque limits and contact rows it could not keep.
 pub const QP: u32 = 113;
 /// The plan is farther from the nominal than a linearisation reaches.
 pub const FAR: u32 = 114;
