@@ -10,7 +10,6 @@ use delmpc_horizon::legged_tasks::LeggedWeights;
 use delmpc_horizon::motion_reference::{MotionReference, SwingShape};
 use delmpc_horizon::stage_grid::StageGrid;
 use delmpc_horizon::step_plan::Step;
-use delmpc_lq::projected_qp::ProjectedQpOptions;
 use delmpc_mechanics::contact_stage::BoundaryState;
 use delmpc_mechanics::kinematics::{Configuration, Kinematics, base_pose_from_link};
 use delmpc_scenario::{ControllerKind, GaitKind, GaitSettings};
@@ -19,12 +18,9 @@ use nalgebra::Vector3;
 use crate::robot_controller::{estimator_config, estimator_model};
 use crate::setup::Setup;
 
-/// Rows the dual has room for: those of all feet, and the joint ranges of two legs at their stops.
-const QP_ROWS: usize = 128;
-
 /// Lift of a swing foot, flat or a point, and where it ends below the ground, as parts of the height of the mass centre.
 const LIFT_PART: f64 = 0.08;
-const POINT_LIFT_PART: f64 = 0.15;
+const POINT_LIFT_PART: f64 = 0.2;
 const DEPTH_PART: f64 = 0.004;
 
 /// The robot as the horizon has it.
@@ -130,7 +126,7 @@ pub fn config(setup: &Setup, model: &LeggedModel) -> Result<LeggedConfig, String
         },
         crouch_m: legged.crouch_m,
         motion: motion(setup, model)?,
-        qp: ProjectedQpOptions { capacity: QP_ROWS, ..core_config.qp },
+        qp: core_config.qp,
         fallback: core_config.fallback,
         max_state_age_s: settings.max_state_age_s,
         command_life_s: settings.command_life_s,

@@ -222,7 +222,7 @@ impl LeggedController {
         Ok(Self {
             sensing: LeggedSensing::new(&robot)?,
             ladder: FallbackLadder::new(config.fallback),
-            retiming: Retiming::new(places.len()),
+            retiming: Retiming::new(&flat),
             ground: GroundPlane::new(&places, &flat),
             flat,
             height_m: reference.aim().height_m,

@@ -38,6 +38,8 @@ impl Foothold {
 pub struct Stance {
     /// Touchdown, s.
     pub begin_s: f64,
+    /// Touchdown as it was planned, s.
+    pub touch_planned_s: f64,
     /// Lift-off, s; infinite: none planned.
     pub end_s: f64,
     /// Lift-off as it was planned, s.
@@ -53,6 +55,8 @@ pub struct Swing {
     pub begin_s: f64,
     /// Touchdown, s.
     pub end_s: f64,
+    /// Touchdown as it was planned: a foot that is late has made its way, s.
+    pub planned_end_s: f64,
     /// From where.
     pub from: Foothold,
     /// To where.
@@ -83,7 +87,8 @@ impl ContactSchedule {
         let foot = |place: &Foothold| {
             let mut stances = Vec::with_capacity(room.max(2));
             let (begin_s, end_s) = (f64::NEG_INFINITY, f64::INFINITY);
-            stances.push(Stance { begin_s, end_s, lift_planned_s: end_s, place: *place });
+            let (touch_planned_s, lift_planned_s) = (begin_s, end_s);
+            stances.push(Stance { begin_s, touch_planned_s, end_s, lift_planned_s, place: *place });
             stances
         };
         Self { feet: places.iter().map(foot).collect() }
@@ -107,7 +112,8 @@ impl ContactSchedule {
         let Some(last) = at.checked_sub(1).map(|k| stances[k]) else {
             let to = stances.first().map_or(nowhere, |stance| stance.place);
             let end_s = stances.first().map_or(f64::INFINITY, |stance| stance.begin_s);
-            return FootPhase::Swing(Swing { begin_s: f64::NEG_INFINITY, end_s, from: to, to });
+            let (begin_s, planned_end_s) = (f64::NEG_INFINITY, end_s);
+            return FootPhase::Swing(Swing { begin_s, end_s, planned_end_s, from: to, to });
         };
         if time_s + SAME_TIME_S < last.end_s {
             return FootPhase::Stance(last);
@@ -116,6 +122,7 @@ impl ContactSchedule {
         FootPhase::Swing(Swing {
             begin_s: last.end_s,
             end_s: next.map_or(f64::INFINITY, |stance| stance.begin_s),
+            planned_end_s: next.map_or(f64::INFINITY, |stance| stance.touch_planned_s),
             from: last.place,
             to: next.map_or(last.place, |stance| stance.place),
         })
@@ -143,7 +150,8 @@ impl ContactSchedule {
         }
         (last.end_s, last.lift_planned_s) = (lift_s, lift_s);
         let end_s = f64::INFINITY;
-        stances.push(Stance { begin_s: touch_s, end_s, lift_planned_s: end_s, place: to });
+        let (begin_s, touch_planned_s, lift_planned_s) = (touch_s, touch_s, end_s);
+        stances.push(Stance { begin_s, touch_planned_s, end_s, lift_planned_s, place: to });
         true
     }
 
@@ -171,6 +179,14 @@ impl ContactSchedule {
             let earliest = stances[next - 1].end_s;
             let latest = stances[next].end_s;
             stances[next].begin_s = touch_s.max(earliest).min(latest);
+        }
+    }
+
+    /// The swing at `time_s` is stretched to a touchdown at `touch_s`.
+    pub fn plan_touchdown(&mut self, foot: usize, time_s: f64, touch_s: f64) {
+        let Some(stances) = self.feet.get_mut(foot) else { return };
+        if let Some(next) = stances.iter_mut().find(|stance| stance.begin_s > time_s + SAME_TIME_S) {
+            next.touch_planned_s = touch_s;
         }
     }
 

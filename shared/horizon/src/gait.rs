@@ -88,7 +88,8 @@ impl GaitWalk {
                 let there = last
                     .is_some_and(|last| (last.place.position_w.xy() - to.position_w.xy()).norm() < THERE_M);
                 let over = lift_s >= self.path.stop_s - 0.5 * period_s;
-                if !(there && over) && !schedule.step(foot, lift_s, touch_s, to) {
+                let stays = there && over;
+                if !stays && !schedule.step(foot, lift_s, touch_s, to) {
                     break;
                 }
                 self.stride[foot] += 1;

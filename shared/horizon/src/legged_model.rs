@@ -87,7 +87,7 @@ impl LeggedModel {
             }
         }
         for (index, limit) in self.limits.iter().enumerate() {
-            if limit.effort.is_nan() || limit.effort <= 0.0 || !(limit.lower <= limit.upper) {
+            if limit.effort.is_nan() || limit.effort <= 0.0 || !limit.lower.le(&limit.upper) {
                 let (quantity, value) = ("limit of a joint", limit.effort);
                 let rule = "effort must be positive and the range must not be empty";
                 return Err(HorizonError::Value { quantity, index, value, rule });

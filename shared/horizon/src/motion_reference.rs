@@ -393,7 +393,7 @@ impl MotionReference {
 
 /// Where a foot in the air shall be.
 pub fn swing_place(swing: &Swing, shape: &SwingShape, time_s: f64) -> Foothold {
-    let part = ((time_s - swing.begin_s) / (swing.end_s - swing.begin_s)).clamp(0.0, 1.0);
+    let part = ((time_s - swing.begin_s) / (swing.planned_end_s - swing.begin_s)).clamp(0.0, 1.0);
     let part = if part.is_finite() { part } else { 1.0 };
     let minimum_jerk = |x: f64| x * x * x * (10.0 + x * (6.0 * x - 15.0));
     let s = minimum_jerk((part / OVER_FOOTHOLD).min(1.0));

@@ -8,7 +8,8 @@
 //! | a foot that shall stand has carried nothing for 30 ms | it bounced, or never landed: it is in the air, on its way down |
 //! | a foot shall lift off while another one is late | it waits for that one, up to half of its own swing |
 //!
-//! What comes later stays as it was planned.
+//! What comes later stays as it was planned. The last two rows are for points, which graze the ground and slide off it; a flat foot that has
+//! landed stays in the plan, and one that is late stretches its swing: over the long step of a walker the mass centre cannot wait.
 
 use alloc::vec;
 use alloc::vec::Vec;
@@ -34,6 +35,7 @@ pub struct FootState {
 
 /// Part of a swing after which a load is a landing: before, it is a stumble.
 const LANDS_FROM: f64 = 0.7;
+const FLAT_LANDS_FROM: f64 = 0.5;
 /// A foot that shall stand and carries nothing for so long is in the air, s.
 const UNLOADED_S: f64 = 0.03;
 /// A lift-off waits for a late foot up to this part of its swing.
@@ -47,12 +49,15 @@ pub struct Retiming {
     /// How long a foot that shall stand has carried nothing, s.
     unloaded_s: Vec<f64>,
     late: Vec<bool>,
+    flat: Vec<bool>,
 }
 
 impl Retiming {
-    /// For `feet` feet.
-    pub fn new(feet: usize) -> Self {
-        Self { lifted: vec![false; feet], unloaded_s: vec![0.0; feet], late: vec![false; feet] }
+    /// For feet that are flat, or points.
+    pub fn new(flat: &[bool]) -> Self {
+        let feet = flat.len();
+        let (lifted, late) = (vec![false; feet], vec![false; feet]);
+        Self { lifted, unloaded_s: vec![0.0; feet], late, flat: flat.to_vec() }
     }
 
     /// Moves the switches of a cycle at `now_s`, the next one after `period_s`; what is decided acts `delay_s` later. Returns a bit for
@@ -76,7 +81,8 @@ impl Retiming {
                         schedule.place(k, now_s, foot.place);
                     } else {
                         self.unloaded_s[k] += period_s;
-                        if self.unloaded_s[k] >= UNLOADED_S && stance.end_s > now_s + 2.0 * ahead_s {
+                        let bounced = !self.flat[k] && self.unloaded_s[k] >= UNLOADED_S;
+                        if bounced && stance.end_s > now_s + 2.0 * ahead_s {
                             self.late[k] = true;
                             let gap = (foot.place.position_w.z - stance.place.position_w.z).max(0.0);
                             let rest = (gap / SEARCH_SPEED_M_S).max(period_s);
@@ -89,24 +95,32 @@ impl Retiming {
                 FootPhase::Swing(swing) => {
                     self.unloaded_s[k] = 0.0;
                     self.lifted[k] |= !foot.loaded;
-                    let lands_s = swing.begin_s + LANDS_FROM * (swing.end_s - swing.begin_s);
+                    let from = if self.flat[k] { FLAT_LANDS_FROM } else { LANDS_FROM };
+                    let lands_s = swing.begin_s + from * (swing.end_s - swing.begin_s);
                     let lands = !lands_s.is_finite() || now_s > lands_s;
                     if foot.loaded && self.lifted[k] && lands {
                         schedule.move_touchdown(k, now_s, now_s);
                         schedule.place(k, now_s, foot.place);
                         moved |= 1 << k;
                     } else if !foot.loaded && swing.end_s < now_s + ahead_s {
-                        self.late[k] = true;
+                        self.late[k] = !self.flat[k];
                         let gap = (foot.place.position_w.z - swing.to.position_w.z).max(0.0);
-                        let rest = (gap / SEARCH_SPEED_M_S).max(period_s);
+                        let rest =
+                            (gap / SEARCH_SPEED_M_S).max(if self.flat[k] { ahead_s } else { period_s });
                         let mut to = swing.to;
-                        let near = gap < SEARCH_SPEED_M_S * period_s;
+                        let touch_s = now_s + ahead_s + rest;
+                        let near = gap < SEARCH_SPEED_M_S * ahead_s;
                         if near && swing.from.position_w.z - to.position_w.z < DEEPEST_M {
                             // The ground is lower than it was thought to be.
-                            to.position_w.z -= SEARCH_SPEED_M_S * period_s;
+                            let longer_s =
+                                if self.flat[k] { ahead_s } else { (touch_s - swing.end_s).max(0.0) };
+                            to.position_w.z -= SEARCH_SPEED_M_S * longer_s;
                             schedule.aim(k, now_s, to);
                         }
-                        schedule.move_touchdown(k, now_s, now_s + ahead_s + rest);
+                        schedule.move_touchdown(k, now_s, touch_s);
+                        if self.flat[k] {
+                            schedule.plan_touchdown(k, now_s, touch_s);
+                        }
                         moved |= 1 << k;
                     }
                 }
@@ -122,12 +136,10 @@ impl Retiming {
     fn wait(&self, schedule: &mut ContactSchedule, now_s: f64, period_s: f64, ahead_s: f64) -> u32 {
         let mut moved = 0;
         for k in (0..self.late.len()).filter(|k| !self.late[*k]) {
-            if let FootPhase::Stance(stance) = schedule.phase(k, now_s) {
-                if stance.end_s < now_s + ahead_s
-                    && schedule.move_lift_off(k, now_s, stance.end_s + period_s, WAITS)
-                {
-                    moved |= 1 << k;
-                }
+            let FootPhase::Stance(stance) = schedule.phase(k, now_s) else { continue };
+            let lifts = stance.end_s < now_s + ahead_s;
+            if lifts && schedule.move_lift_off(k, now_s, stance.end_s + period_s, WAITS) {
+                moved |= 1 << k;
             }
         }
         moved
@@ -167,7 +179,7 @@ mod tests {
 
     #[test]
     fn an_early_foot_stands_where_it_is() {
-        let (mut schedule, mut retiming) = (swinging(), Retiming::new(1));
+        let (mut schedule, mut retiming) = (swinging(), Retiming::new(&[false]));
         let scuffs = foot(true, 0.28, 0.01);
         assert_eq!(retiming.update(&mut schedule, &scuffs, 1.1, TIMES), 0, "it has not left the ground");
         assert_eq!(retiming.update(&mut schedule, &foot(false, 0.1, 0.05), 1.15, TIMES), 0);
@@ -179,7 +191,7 @@ mod tests {
 
     #[test]
     fn a_late_foot_goes_on_down() {
-        let (mut schedule, mut retiming) = (swinging(), Retiming::new(1));
+        let (mut schedule, mut retiming) = (swinging(), Retiming::new(&[false]));
         let high = foot(false, 0.3, 0.015);
         assert_eq!(retiming.update(&mut schedule, &high, 1.38, TIMES), 0);
         assert_eq!(retiming.update(&mut schedule, &high, 1.395, TIMES), 1);
@@ -191,7 +203,7 @@ mod tests {
 
     #[test]
     fn a_foot_that_bounced_lands_again() {
-        let (mut schedule, mut retiming) = (swinging(), Retiming::new(1));
+        let (mut schedule, mut retiming) = (swinging(), Retiming::new(&[false]));
         retiming.update(&mut schedule, &foot(false, 0.2, 0.03), 1.3, TIMES);
         retiming.update(&mut schedule, &foot(true, 0.28, 0.0), 1.36, TIMES);
         let up = foot(false, 0.28, 0.003);
@@ -208,7 +220,7 @@ mod tests {
         let mut schedule = ContactSchedule::standing(&[at(0.0, 0.0), at(0.0, 0.0)], 4);
         schedule.step(0, 1.0, 1.4, at(0.3, 0.0));
         schedule.step(1, 1.4, 1.8, at(0.3, 0.0));
-        let mut retiming = Retiming::new(2);
+        let mut retiming = Retiming::new(&[false; 2]);
         let feet = [foot(false, 0.3, 0.01)[0], foot(true, 0.0, 0.0)[0]];
         assert_eq!(retiming.update(&mut schedule, &feet, 1.395, TIMES), 3);
         assert!(schedule.stands(1, 1.405) && !schedule.stands(1, 1.411));

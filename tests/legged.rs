@@ -1,0 +1,127 @@
+//! Robots on several feet and on their way, lockstep, noise and delay as in the scenarios. The figures of many seeds:
+//! `cargo test --release --test legged -- --ignored --nocapture`.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+use std::path::Path;
+
+use delmpc::legged_metrics::LeggedFigures;
+use delmpc::log::Log;
+use delmpc::one_process::{Simulated, simulate};
+use delmpc::plant_process::Plant;
+use delmpc::robot_controller::RobotController;
+use delmpc::setup::Setup;
+use delmpc::simulated_robot::SimulatedRobot;
+use delmpc::summary::Summary;
+use delmpc_controller_process::controller_loop::Controller;
+use delmpc_controller_process::stop::StopFlag;
+use delmpc_messages::{Command, PlantState};
+use stats_alloc::{INSTRUMENTED_SYSTEM, Region, StatsAlloc};
+
+#[global_allocator]
+static ALLOCATOR: &StatsAlloc<std::alloc::System> = &INSTRUMENTED_SYSTEM;
+
+fn setup(scenario: &str, overrides: &[&str]) -> Setup {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("configs/scenarios/{scenario}.toml"));
+    let mut all = vec!["clock=lockstep".to_owned()];
+    all.extend(overrides.iter().map(|change| (*change).to_owned()));
+    Setup::read(&file, &all).unwrap()
+}
+
+fn run(scenario: &str, overrides: &[&str]) -> Summary {
+    let setup = setup(scenario, overrides);
+    match simulate(&setup, Log::none(), &StopFlag::on_signals().unwrap()).unwrap() {
+        Simulated::Fault(why) => panic!("{scenario} {overrides:?}: {why}"),
+        Simulated::Ended { plant, .. } => Summary::new(&setup.scenario, Some(*plant), None, None),
+    }
+}
+
+fn feet(summary: &Summary) -> &LeggedFigures {
+    summary.plant.as_ref().and_then(|plant| plant.robot.legged.as_ref()).unwrap()
+}
+
+fn stands(scenario: &str, overrides: &[&str]) -> Summary {
+    let summary = run(scenario, overrides);
+    let robot = &summary.plant.as_ref().unwrap().robot;
+    println!("{scenario} {overrides:?}: {:?} {:?}", summary.failure, robot.legged);
+    assert!(!robot.fell, "{scenario} {overrides:?}: {:?}", summary.failure);
+    summary
+}
+
+#[test]
+fn atlas_takes_a_push_on_two_feet() {
+    let summary = stands("atlas_two_feet", &["duration_s=3.0"]);
+    let robot = &summary.plant.as_ref().unwrap().robot;
+    assert_eq!((feet(&summary).contact_sets_visited, feet(&summary).steps_taken), (1, 0));
+    assert!(robot.settle_time_s.is_none_or(|settled| settled < 3.0));
+}
+
+#[test]
+fn atlas_walks() {
+    let summary = stands("atlas_walk", &["duration_s=3.6"]);
+    let figures = feet(&summary);
+    assert!(figures.steps_taken >= 3, "{figures:?}");
+    assert!(figures.landing_error_max_m.unwrap() < 0.01, "{figures:?}");
+    assert!(figures.max_slip_m < 0.01, "{figures:?}");
+}
+
+#[test]
+fn littledog_trots_and_keeps_to_its_path() {
+    let summary = stands("littledog_trot", &["duration_s=3.0"]);
+    let figures = feet(&summary);
+    assert!(figures.steps_taken >= 12, "{figures:?}");
+    assert!(figures.base_error_rms_m.unwrap() < 0.006, "{figures:?}");
+}
+
+#[test]
+fn an_unknown_foot_and_feet_that_are_left_out_are_refused_with_their_names() {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/scenarios/atlas_walk.toml");
+    let refused = |change: &str| Setup::read(&file, &[change.to_owned()]).unwrap_err().to_string();
+    assert!(refused("step[3].foot=middle").contains("step[3].foot"), "{}", refused("step[3].foot=middle"));
+    assert!(refused("robot.stance=[\"right\"]").contains("left"));
+    assert!(refused("robot.stance=[\"right\", \"tail\"]").contains("tail"));
+}
+
+#[test]
+fn a_cycle_takes_no_memory() {
+    for scenario in ["atlas_walk", "littledog_trot"] {
+        let setup = setup(scenario, &[]);
+        let mut robot = SimulatedRobot::new(&setup).unwrap();
+        let mut controller = RobotController::new(&setup).unwrap();
+        let joints = setup.robot.joint_names.len() as u32;
+        let mut state = Box::new(PlantState::new(0, setup.joint_set_hash(), joints));
+        let mut command = Box::new(Command::new(0, setup.joint_set_hash(), joints));
+        robot.measure(&mut state);
+        // The first cycles place the feet and fill what is lazily made.
+        for cycle in 0..60_u64 {
+            state.header.sequence = cycle + 1;
+            state.time_ns = cycle * 10_000_000;
+            let region = Region::new(ALLOCATOR);
+            controller.cycle(&state, state.time_ns, &mut command);
+            let taken = region.change().allocations;
+            assert!(cycle < 3 || taken == 0, "{scenario}: {taken} allocations in cycle {cycle}");
+        }
+    }
+}
+
+#[test]
+#[ignore = "many minutes"]
+fn seeds_slopes_masses_and_gaits() {
+    for seed in 1..=20 {
+        let seed = format!("seed={seed}");
+        stands("atlas_walk", &[&seed]);
+        stands("littledog_trot", &[&seed]);
+        stands("littledog_rough", &[&seed]);
+    }
+    for change in [
+        "plant.slope_rad=[0.05236, 0.0]",
+        "plant.slope_rad=[-0.05236, 0.0]",
+        "plant.slope_rad=[0.0, 0.05236]",
+        "plant.ground_sink_m=0.7e-3",
+        "plant.mass_scale=1.1",
+    ] {
+        stands("atlas_walk", &[change]);
+    }
+    for gait in [["gait.kind=walk", "gait.speed_m_s=0.1"], ["gait.kind=bound", "gait.speed_m_s=0.1"]] {
+        stands("littledog_trot", &["gait.yaw_rate_rad_s=0.0", gait[0], gait[1]]);
+    }
+}
