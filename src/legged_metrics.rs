@@ -131,12 +131,12 @@ impl LeggedMetrics {
             let bit = 1 << foot;
             if was & bit != 0 && is & bit == 0 {
                 self.lifted_s[foot] = time_s;
-            } else if was & bit == 0 && is & bit != 0 && time_s - self.lifted_s[foot] >= STEP_S {
-                if self.lifted_s[foot] > 0.0 {
-                    self.figures.steps_taken += 1;
-                    self.first_lift_s.get_or_insert(self.lifted_s[foot]);
-                    self.last_touch_s = time_s;
-                }
+            }
+            let lands = was & bit == 0 && is & bit != 0 && self.lifted_s[foot] > 0.0;
+            if lands && time_s - self.lifted_s[foot] >= STEP_S {
+                self.figures.steps_taken += 1;
+                self.first_lift_s.get_or_insert(self.lifted_s[foot]);
+                self.last_touch_s = time_s;
             }
         }
         match (is, self.airborne_since_s) {

@@ -7,18 +7,9 @@ use std::path::Path;
 use delmpc::legged_metrics::LeggedFigures;
 use delmpc::log::Log;
 use delmpc::one_process::{Simulated, simulate};
-use delmpc::plant_process::Plant;
-use delmpc::robot_controller::RobotController;
 use delmpc::setup::Setup;
-use delmpc::simulated_robot::SimulatedRobot;
 use delmpc::summary::Summary;
-use delmpc_controller_process::controller_loop::Controller;
 use delmpc_controller_process::stop::StopFlag;
-use delmpc_messages::{Command, PlantState};
-use stats_alloc::{INSTRUMENTED_SYSTEM, Region, StatsAlloc};
-
-#[global_allocator]
-static ALLOCATOR: &StatsAlloc<std::alloc::System> = &INSTRUMENTED_SYSTEM;
 
 fn setup(scenario: &str, overrides: &[&str]) -> Setup {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("configs/scenarios/{scenario}.toml"));
@@ -79,28 +70,6 @@ fn an_unknown_foot_and_feet_that_are_left_out_are_refused_with_their_names() {
     assert!(refused("step[3].foot=middle").contains("step[3].foot"), "{}", refused("step[3].foot=middle"));
     assert!(refused("robot.stance=[\"right\"]").contains("left"));
     assert!(refused("robot.stance=[\"right\", \"tail\"]").contains("tail"));
-}
-
-#[test]
-fn a_cycle_takes_no_memory() {
-    for scenario in ["atlas_walk", "littledog_trot"] {
-        let setup = setup(scenario, &[]);
-        let mut robot = SimulatedRobot::new(&setup).unwrap();
-        let mut controller = RobotController::new(&setup).unwrap();
-        let joints = setup.robot.joint_names.len() as u32;
-        let mut state = Box::new(PlantState::new(0, setup.joint_set_hash(), joints));
-        let mut command = Box::new(Command::new(0, setup.joint_set_hash(), joints));
-        robot.measure(&mut state);
-        // The first cycles place the feet and fill what is lazily made.
-        for cycle in 0..60_u64 {
-            state.header.sequence = cycle + 1;
-            state.time_ns = cycle * 10_000_000;
-            let region = Region::new(ALLOCATOR);
-            controller.cycle(&state, state.time_ns, &mut command);
-            let taken = region.change().allocations;
-            assert!(cycle < 3 || taken == 0, "{scenario}: {taken} allocations in cycle {cycle}");
-        }
-    }
 }
 
 #[test]

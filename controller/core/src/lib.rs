@@ -9,11 +9,13 @@
 //! its first gain, and torque and reference of its next tenth of a second. [`cycle::Controller::cycle`] always answers.
 //!
 //! Without the default feature `clarabel` the crate is `no_std` and needs `alloc` in constructors only; the QP is then solved by
-//! [`active_set_dual`].
+//! [`delmpc_lq::active_set_dual`].
 //!
-//! Reading order: [`model`], [`config`], [`cycle`]; then in the order of the cycle [`estimator`], [`plan`], [`horizon_dynamics`], [`stage_dynamics`],
-//! [`node_kinematics`], [`tasks`], [`mod@reference`], [`contact_wrench`], [`lq_problem`], [`riccati`], [`dare`], [`projected_qp`],
-//! [`dual_qp`], [`fallback`]. Files without public items: `feedback_law.rs` (what a command carries), `level_stance.rs` (a foot that is not level), `unloaded_leg.rs` (one that carries nothing), `balance_trim.rs` (wrong masses), `prediction.rs` (delay).
+//! Reading order: [`model`], [`config`], [`cycle`]; then in the order of the cycle [`estimator`], [`plan`], [`horizon_dynamics`],
+//! [`stage_dynamics`], [`node_kinematics`], [`tasks`], [`mod@reference`], [`contact_wrench`], the solver ([`delmpc_lq`]), [`fallback`].
+//! [`legged`] is the same cycle for a robot on any set of feet, on the horizons of [`delmpc_horizon`]. Files without public items:
+//! `feedback_law.rs` (what a command carries), `level_stance.rs` (a foot that is not level), `unloaded_leg.rs` (one that carries
+//! nothing), `balance_trim.rs` (wrong masses), `prediction.rs` (delay).
 #![allow(clippy::needless_range_loop)]
 #![cfg_attr(not(feature = "std"), no_std)]
 #![forbid(unsafe_code)]
