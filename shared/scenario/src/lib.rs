@@ -34,6 +34,7 @@ mod list;
 mod plan;
 mod range;
 mod scenario;
+mod timing;
 
 pub use document::Document;
 pub use error::{Place, ScenarioError};
@@ -43,5 +44,6 @@ pub use ground::{BoxSettings, GapSettings, RobotSettings, StartSettings, Terrain
 pub use plan::{PlanBound, PlanGap, PlanObstacle, PlanSettings, PlanSpring, PlanStep, PlanWeightSettings};
 pub use scenario::{
     Clock, ConstraintSettings, ControllerKind, ControllerSettings, PlantSettings, ProcessSettings,
-    PushSettings, ReachSettings, Scenario, SensorSettings, SuccessSettings, TimingSettings, WeightSettings,
+    PushSettings, ReachSettings, Scenario, SensorSettings, SuccessSettings, WeightSettings,
 };
+pub use timing::TimingSettings;
