@@ -158,7 +158,7 @@ pub fn clamp_efforts(robot: &mut RobotModel) -> Vec<String> {
         };
         if limit.effort.is_finite() && limit.effort > largest && largest > 0.0 {
             warnings.push(format!(
-                "joint `{name}`: effort {} {unit} is a placeholder for a robot of {:.1} kg: {largest:.0} {unit} is used; give the motor's own",
+                "joint `{name}`: effort {} {unit} is no motor's for a robot of {:.1} kg: {largest:.0} {unit} is used; give the motor's own",
                 limit.effort,
                 robot.tree.total_mass()
             ));

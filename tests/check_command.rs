@@ -127,11 +127,11 @@ fn a_placeholder_for_an_effort_is_lowered_and_the_robot_stands() {
     let folder = lamp("effort", &[("lamp.urdf", "effort=\"20\"", "effort=\"1e6\"")]);
     let (status, _, err) = delmpc(&folder, &["check", "reach.toml"]);
     assert_eq!(status, Some(0), "{err}");
-    says(&err, 1, "warning: ", &["joint `swivel`: effort 1000000 N m is a placeholder", "N m is used"]);
+    says(&err, 1, "warning: ", &["joint `swivel`: effort 1000000 N m is no motor's", "N m is used"]);
     let run = ["run", "reach.toml", "--set", "clock=lockstep", "--no-report", "--out", "run", "--json"];
     let (status, out, err) = delmpc(&folder, &run);
     assert_eq!(status, Some(0), "{out}{err}");
-    assert!(err.contains("is a placeholder"), "{err}");
+    assert!(err.contains("is no motor's"), "{err}");
 }
 
 #[test]
