@@ -40,6 +40,7 @@ use crate::reference::{Reach, Reference};
 use crate::stop_watch::StopWatch;
 pub use crate::stop_watch::{Clock, StoppedClock};
 use crate::tasks::TaskTargets;
+use crate::telling::tell_constraints;
 use crate::unloaded_leg::UnloadedLeg;
 use delmpc_horizon::foot_cone::{FlatFoot, WrenchCone};
 use delmpc_lq::dual_qp::QpSolver;
@@ -57,8 +58,6 @@ mod views;
 /// So many states in a row that are older than the newest one are right, and the newest one was wrong.
 const OLDER_STATES: u32 = 5;
 
-/// A violation beyond this part of a constraint's scale is reported as [`Verdict::Infeasible`].
-const GAVE_WAY: f64 = 1e-3;
 /// Torques and contact forces of a plan may be beyond their limits by this part of their scale in the stages a command covers ...
 const UNMET_NEAR: f64 = 0.05;
 /// ... and by this later, where there is time for a better plan.
@@ -316,7 +315,7 @@ impl Controller {
         self.command.report.riccati_ns = prepared.riccati_ns;
         let solved = self.solve_constrained();
         self.command.report.qp_ns = watch.lap();
-        self.report_constraints(&solved?);
+        tell_constraints(&solved?, &mut self.command);
         self.check_followable()?;
         self.adopt_plan()?;
         Ok(())
@@ -517,23 +516,6 @@ impl Controller {
         core::mem::swap(&mut self.plan, &mut self.nominal);
         self.has_plan = true;
         Ok(())
-    }
-
-    fn report_constraints(&mut self, report: &ProjectedQpReport) {
-        let out = &mut self.command.report;
-        out.qp_solves = report.solves;
-        out.qp_iterations = report.iterations;
-        out.active_rows = report.active_rows;
-        out.dropped_rows = report.dropped_rows;
-        if let Some(worst) = report.worst.filter(|worst| worst.amount > GAVE_WAY * worst.tag.scale) {
-            out.worst_violation = worst.amount;
-            out.worst_constraint = worst.tag.label;
-            out.worst_stage = u32::from(worst.row.stage);
-            out.worst_row = worst.tag.row;
-            if self.command.verdict == Verdict::Ok as u32 {
-                self.command.verdict = Verdict::Infeasible as u32;
-            }
-        }
     }
 
     fn situation(&self, attempt: Attempt, now_ns: u64) -> Situation {

@@ -30,7 +30,7 @@ use delmpc_horizon::stage_grid::StageGrid;
 use delmpc_horizon::step_plan::{Step, lay_out, mass_centre_over};
 use delmpc_lq::dual_qp::QpSolver;
 use delmpc_lq::kernels::largest;
-use delmpc_lq::projected_qp::{ProjectedQp, ProjectedQpOptions, ProjectedQpReport, default_backend};
+use delmpc_lq::projected_qp::{ProjectedQp, ProjectedQpOptions, default_backend};
 use delmpc_lq::riccati::Riccati;
 use delmpc_lq::trajectory::Trajectory;
 use delmpc_mechanics::contact_stage::BoundaryState;
@@ -45,6 +45,7 @@ use crate::errors::ControlError;
 use crate::fallback::{Attempt, FallbackConfig, FallbackLadder, Situation};
 use crate::feedback_law::Law;
 use crate::stop_watch::{Clock, StopWatch};
+use crate::telling::tell_constraints;
 
 mod law;
 mod light_feet;
@@ -55,8 +56,6 @@ use light_feet::LightFeet;
 use prediction::StatePrediction;
 use sensing::LeggedSensing;
 
-/// A violation beyond this part of a constraint's scale is reported as [`Verdict::Infeasible`].
-const GAVE_WAY: f64 = 1e-3;
 /// A plan that moves a boundary by more than this (rad, m) is not believed.
 const LARGEST_MOVE: f64 = 1.0;
 /// Stances of a foot there is room for: those of a horizon, and the steps of a walk.
@@ -147,7 +146,8 @@ pub struct LeggedConfig {
     pub rate_mean_s: f64,
 }
 
-/// The controller: everything it needs for a cycle, allocated once.
+/// The controller: everything it needs for a cycle. Memory is taken in [`LeggedController::new`], and in the first good cycle, which
+/// places feet and steps where the robot has been measured.
 #[derive(Debug)]
 pub struct LeggedController {
     robot: LeggedRobot,
@@ -188,8 +188,6 @@ pub struct LeggedController {
     last_state_ns: Option<u64>,
     older_states: u32,
     last_sequence: u64,
-    /// Bits of the feet that came early or late in the last cycle.
-    retimed: u32,
 }
 
 impl LeggedController {
@@ -250,7 +248,6 @@ impl LeggedController {
             last_state_ns: None,
             older_states: 0,
             last_sequence: 0,
-            retimed: 0,
             grid,
             reference,
             problem,
@@ -316,7 +313,7 @@ impl LeggedController {
         self.command.report.qp_ns = watch.lap();
         let report = solved.map_err(|_| reason::QP)?;
         self.adopt_plan()?;
-        self.report_constraints(&report);
+        tell_constraints(&report, &mut self.command);
         Ok(())
     }
 
@@ -426,7 +423,7 @@ impl LeggedController {
         let Self { schedule, grid, reference, walk, sensing, robot, ground, .. } = self;
         let model = &robot.model;
         let times = (self.config.period_s, start_s - measured_s);
-        self.retimed = self.retiming.update(schedule, sensing.feet(), measured_s, times);
+        self.retiming.update(schedule, sensing.feet(), measured_s, times);
         ground.update(schedule, sensing.feet(), measured_s, self.config.period_s);
         let aim = reference.aim_mut();
         let [place, ..] = aim.mass_centre_at(measured_s);
@@ -517,21 +514,6 @@ impl LeggedController {
         core::mem::swap(&mut self.plan, &mut self.nominal);
         (self.has_plan, self.is_astray) = (true, false);
         Ok(())
-    }
-
-    fn report_constraints(&mut self, report: &ProjectedQpReport) {
-        let out = &mut self.command.report;
-        out.qp_solves = report.solves;
-        out.qp_iterations = report.iterations;
-        out.active_rows = report.active_rows;
-        out.dropped_rows = report.dropped_rows;
-        if let Some(worst) = report.worst.filter(|worst| worst.amount > GAVE_WAY * worst.tag.scale) {
-            out.worst_violation = worst.amount;
-            out.worst_constraint = worst.tag.label;
-            out.worst_stage = u32::from(worst.row.stage);
-            out.worst_row = worst.tag.row;
-            self.command.verdict = Verdict::Infeasible as u32;
-        }
     }
 
     /// Sets the plant time that counts as zero of the run.

@@ -45,6 +45,7 @@ pub mod reference;
 pub mod stage_dynamics;
 mod stop_watch;
 pub mod tasks;
+mod telling;
 mod unloaded_leg;
 
 /// What a process needs to run a controller.

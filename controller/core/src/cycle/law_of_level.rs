@@ -9,13 +9,13 @@
 //! | zero torque | 0 | 0 | |
 
 use delmpc_mechanics::inverse_dynamics::gravity_force_into;
-use delmpc_messages::{FallbackLevel, LARGEST_EFFORT, PlantState, StateEstimate};
-use nalgebra::{Rotation3, UnitQuaternion};
+use delmpc_messages::{FallbackLevel, LARGEST_EFFORT, PlantState};
 
 use super::{Controller, to_ns};
 use crate::config::ControllerKind;
 use crate::estimator::Estimate;
 use crate::feedback_law::{LawSegment, bound_by_pressure_point, write_law};
+use crate::telling::state_estimate;
 use delmpc_lq::kernels::gemv;
 
 /// Part of effort over velocity limit that damps a joint on the last rungs.
@@ -65,20 +65,9 @@ impl Controller {
 
     /// What is believed of base and feet goes along.
     fn tell_estimate(&mut self) {
-        let out = &mut self.command.estimate;
         let Some(base) = self.estimator.base() else { return };
-        let rotation = Rotation3::from_matrix_unchecked(base.base_link_pose_w.rotation);
-        *out = StateEstimate {
-            known: 1,
-            feet_loaded: (self.estimator.feet().iter().enumerate())
-                .map(|(k, foot)| u32::from(foot.loaded) << k)
-                .sum(),
-            base_orientation_w: UnitQuaternion::from_rotation_matrix(&rotation).coords.into(),
-            base_angular_velocity_b: base.base_twist_b.angular.into(),
-            base_linear_velocity_b: base.base_twist_b.linear.into(),
-            gyro_bias: base.gyro_bias.into(),
-            accelerometer_bias: base.accelerometer_bias.into(),
-        };
+        let loaded = self.estimator.feet().iter().map(|foot| foot.loaded);
+        self.command.estimate = state_estimate(base, loaded);
     }
 
     /// Writes the law out: in terms of the encoders, and of the gyroscope where the stance foot was levelled.

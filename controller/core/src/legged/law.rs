@@ -1,11 +1,11 @@
 //! The law a command carries: the plan's torques and joints, the joint part of the first gain, damping where there is no plan.
 
-use delmpc_messages::{Command, FallbackLevel, LARGEST_EFFORT, PlantState, StateEstimate};
-use nalgebra::{Rotation3, UnitQuaternion};
+use delmpc_messages::{Command, FallbackLevel, LARGEST_EFFORT, PlantState};
 
 use super::LeggedController;
 use crate::config::ControllerKind;
 use crate::feedback_law::{LawSegment, write_law};
+use crate::telling::state_estimate;
 
 /// Part of effort over velocity limit that damps a joint on the last levels.
 const DAMPING_FRACTION: f64 = 0.1;
@@ -41,19 +41,10 @@ impl LeggedController {
     }
 
     fn tell_estimate(&mut self) {
-        let base = self.sensing.base();
-        let rotation = Rotation3::from_matrix_unchecked(base.base_link_pose_w.rotation);
-        self.command.estimate = StateEstimate {
-            known: u32::from(self.last_state_ns.is_some()),
-            feet_loaded: (self.sensing.feet().iter().enumerate())
-                .map(|(k, foot)| u32::from(foot.loaded) << k)
-                .sum(),
-            base_orientation_w: UnitQuaternion::from_rotation_matrix(&rotation).coords.into(),
-            base_angular_velocity_b: base.base_twist_b.angular.into(),
-            base_linear_velocity_b: base.base_twist_b.linear.into(),
-            gyro_bias: base.gyro_bias.into(),
-            accelerometer_bias: base.accelerometer_bias.into(),
-        };
+        if self.last_state_ns.is_some() {
+            let loaded = self.sensing.feet().iter().map(|foot| foot.loaded);
+            self.command.estimate = state_estimate(self.sensing.base(), loaded);
+        }
     }
 
     fn form_law(&mut self, level: FallbackLevel, time_s: f64) {
