@@ -187,14 +187,13 @@ fn four_footed(settings: &GaitSettings, model: &LeggedModel) -> Result<Gait, Str
             "`gait.kind`: gaits are for four feet, and this robot has {count}: give it steps, [[step]]"
         ));
     }
-    let name = match settings.kind {
-        GaitKind::Trot | GaitKind::FlyingTrot => "trot",
-        GaitKind::Walk => "walk",
-        GaitKind::Pace => "pace",
-        GaitKind::Bound => "bound",
-        GaitKind::Jump => "jump",
+    let of_four = match settings.kind {
+        GaitKind::Trot | GaitKind::FlyingTrot => Gait::TROT,
+        GaitKind::Walk => Gait::WALK,
+        GaitKind::Pace => Gait::PACE,
+        GaitKind::Bound => Gait::BOUND,
+        GaitKind::Jump => Gait::JUMP,
     };
-    let of_four = Gait::of_four(name).unwrap_or_default();
     let mut kinematics = Kinematics::new(&model.tree);
     let home = &model.posture;
     let configuration = Configuration::floating(home.base_pose_w(), &home.q);

@@ -27,19 +27,16 @@ pub struct Gait {
 }
 
 impl Gait {
-    /// A gait of four feet by name, for feet in the order front left, front right, back left, back right; `None`: not known.
-    ///
-    /// `trot`, `pace`, `bound`: pairs; `walk`: one after the other; `jump`: all at once.
-    pub fn of_four(name: &str) -> Option<[f64; 4]> {
-        Some(match name {
-            "trot" => [0.0, 0.5, 0.5, 0.0],
-            "pace" => [0.0, 0.5, 0.0, 0.5],
-            "bound" => [0.0, 0.0, 0.5, 0.5],
-            "walk" => [0.0, 0.5, 0.75, 0.25],
-            "jump" => [0.0; 4],
-            _ => return None,
-        })
-    }
+    /// Diagonal pairs. Phases of four feet are in the order front left, front right, back left, back right.
+    pub const TROT: [f64; 4] = [0.0, 0.5, 0.5, 0.0];
+    /// The two of a side.
+    pub const PACE: [f64; 4] = [0.0, 0.5, 0.0, 0.5];
+    /// The front ones and the back ones.
+    pub const BOUND: [f64; 4] = [0.0, 0.0, 0.5, 0.5];
+    /// One after the other.
+    pub const WALK: [f64; 4] = [0.0, 0.5, 0.75, 0.25];
+    /// All at once.
+    pub const JUMP: [f64; 4] = [0.0; 4];
 }
 
 /// A gait along a path, and how far it has been laid out.

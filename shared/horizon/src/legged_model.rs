@@ -2,7 +2,7 @@
 
 use alloc::vec::Vec;
 
-use delmpc_mechanics::contact_stage::{BoundaryState, Contact, ContactKind};
+use delmpc_mechanics::contact_stage::{BoundaryState, Contact};
 use delmpc_mechanics::spatial::RigidTransform;
 use delmpc_mechanics::tree::KinematicTree;
 use nalgebra::{Matrix3, Vector3};
@@ -116,11 +116,6 @@ impl LeggedModel {
             (0..self.feet.len()).filter(|k| *k != foot).flat_map(|k| branch(&self.feet[k])).collect();
         own.into_iter().filter(|joint| !others.contains(joint)).collect()
     }
-}
-
-/// Rows of a contact: torque about the sole's origin where it is flat, then force, along its ground axes.
-pub fn rows_of(kind: ContactKind) -> usize {
-    kind.rows()
 }
 
 /// Axes with the z axis `normal` and the x axis in the direction of `forward`.
