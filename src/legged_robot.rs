@@ -4,9 +4,9 @@ use delmpc_controller_core::legged::{GaitCommand, LeggedConfig, LeggedRobot, Mot
 use delmpc_controller_core::prelude as core;
 use delmpc_horizon::contact_schedule::{ContactSchedule, Foothold};
 use delmpc_horizon::gait::Gait;
-use delmpc_horizon::legged_model::{FootShape, JointRange, LeggedModel};
-use delmpc_horizon::legged_problem::LeggedLimits;
+use delmpc_horizon::legged_model::{FootShape, LeggedModel};
 use delmpc_horizon::legged_tasks::LeggedWeights;
+use delmpc_horizon::limits::ConstraintConfig;
 use delmpc_horizon::motion_reference::{MotionReference, SwingShape};
 use delmpc_horizon::stage_grid::StageGrid;
 use delmpc_horizon::step_plan::Step;
@@ -15,7 +15,7 @@ use delmpc_mechanics::kinematics::{Configuration, Kinematics, base_pose_from_lin
 use delmpc_scenario::{ControllerKind, GaitKind, GaitSettings};
 use nalgebra::Vector3;
 
-use crate::robot_controller::{estimator_config, estimator_model};
+use crate::robot_controller::{constraints, estimator_config, estimator_model, joint_limits};
 use crate::setup::Setup;
 
 /// Lift of a swing foot, flat or a point, and where it ends below the ground, as parts of the height of the mass centre.
@@ -45,16 +45,7 @@ pub fn model(setup: &Setup) -> Result<LeggedModel, String> {
             .into_iter()
             .map(|foot| FootShape { body: foot.body, sole: foot.sole, polygon: foot.polygon })
             .collect(),
-        limits: robot
-            .limits
-            .iter()
-            .map(|limit| JointRange {
-                lower: limit.lower,
-                upper: limit.upper,
-                effort: limit.effort,
-                velocity: limit.velocity,
-            })
-            .collect(),
+        limits: joint_limits(robot),
         posture: home,
     })
 }
@@ -78,7 +69,7 @@ pub fn robot(setup: &Setup) -> Result<LeggedRobot, String> {
 /// In words: a gait of a robot that does not have four feet.
 pub fn config(setup: &Setup, model: &LeggedModel) -> Result<LeggedConfig, String> {
     let scenario = &setup.scenario;
-    let (settings, limits) = (&scenario.controller, &scenario.controller.constraints);
+    let settings = &scenario.controller;
     let legged = &settings.legged;
     let period_s = 1.0 / settings.mpc_rate_hz;
     let height = mass_centre_height(model)?;
@@ -112,14 +103,7 @@ pub fn config(setup: &Setup, model: &LeggedModel) -> Result<LeggedConfig, String
             sole_torque: legged.sole_torque_per_weight2,
             terminal_s: legged.terminal_s,
         },
-        limits: LeggedLimits {
-            torque_fraction: limits.torque_fraction,
-            friction: limits.friction,
-            cop_margin_m: limits.cop_margin_m,
-            yaw_arm_m: limits.yaw_arm_m,
-            min_force_fraction: legged.min_force_fraction,
-            ..LeggedLimits::default()
-        },
+        limits: ConstraintConfig { min_force_fraction: legged.min_force_fraction, ..constraints(scenario) },
         swing: SwingShape {
             lift_m: or(legged.swing_lift_m, lift),
             depth_m: or(legged.swing_depth_m, DEPTH_PART),

@@ -150,16 +150,7 @@ fn model(setup: &Setup) -> Result<ControllerModel, String> {
         tree: standing.tree.clone(),
         message_joint: ControllerModel::message_joints(&rooted.rerooted),
         joint_set_hash: setup.joint_set_hash(),
-        limits: standing
-            .limits
-            .iter()
-            .map(|limit| JointLimits {
-                lower: limit.lower,
-                upper: limit.upper,
-                effort: limit.effort,
-                velocity: limit.velocity,
-            })
-            .collect(),
+        limits: joint_limits(standing),
         sole: sole.polygon.iter().map(|corner| (*corner).into()).collect(),
         hand: scenario.reach.as_ref().and_then(|reach| point(standing, &reach.hand)),
         swing_foot: other.and_then(|sole| point(standing, &sole.frame)),
@@ -221,6 +212,29 @@ pub fn estimator_config(scenario: &Scenario) -> EstimatorConfig {
     }
 }
 
+/// Limits of a robot's joints.
+pub fn joint_limits(robot: &RobotModel) -> Vec<JointLimits> {
+    let limit = |limit: &delmpc_robots::JointLimits| JointLimits {
+        lower: limit.lower,
+        upper: limit.upper,
+        effort: limit.effort,
+        velocity: limit.velocity,
+    };
+    robot.limits.iter().map(limit).collect()
+}
+
+/// What the plan keeps to.
+pub fn constraints(scenario: &Scenario) -> ConstraintConfig {
+    let limits = &scenario.controller.constraints;
+    ConstraintConfig {
+        torque_fraction: limits.torque_fraction,
+        friction: limits.friction,
+        cop_margin_m: limits.cop_margin_m,
+        yaw_arm_m: limits.yaw_arm_m,
+        ..ConstraintConfig::default()
+    }
+}
+
 /// A frame's origin as a point of its body; `None` when it is fixed to the ground.
 fn point(robot: &RobotModel, frame: &str) -> Option<BodyPoint> {
     let frame = robot.frame(frame)?;
@@ -230,7 +244,7 @@ fn point(robot: &RobotModel, frame: &str) -> Option<BodyPoint> {
 fn config(scenario: &Scenario) -> ControllerConfig {
     let settings = &scenario.controller;
     let period_s = 1.0 / settings.mpc_rate_hz;
-    let (weights, limits) = (&settings.weights, &settings.constraints);
+    let weights = &settings.weights;
     let delays_s = scenario.sensors.delay_s + scenario.plant.actuator_delay_s;
     ControllerConfig {
         kind: match settings.kind {
@@ -254,13 +268,7 @@ fn config(scenario: &Scenario) -> ControllerConfig {
             swing_foot: weights.swing_foot_per_m2,
             swing_foot_rotation: weights.swing_foot_rotation_per_rad2,
         },
-        constraints: ConstraintConfig {
-            torque_fraction: limits.torque_fraction,
-            friction: limits.friction,
-            cop_margin_m: limits.cop_margin_m,
-            yaw_arm_m: limits.yaw_arm_m,
-            ..ConstraintConfig::default()
-        },
+        constraints: constraints(scenario),
         reach: scenario.reach.as_ref().map(|reach| Reach {
             ball_m: reach.ball_m,
             start_s: reach.start_s,

@@ -21,7 +21,7 @@ use delmpc_horizon::contact_schedule::{ContactSchedule, Foothold};
 use delmpc_horizon::gait::{Gait, GaitWalk};
 use delmpc_horizon::ground_plane::GroundPlane;
 use delmpc_horizon::legged_model::{FootShape, LeggedModel};
-use delmpc_horizon::legged_problem::{LeggedLimits, LeggedProblem};
+use delmpc_horizon::legged_problem::LeggedProblem;
 use delmpc_horizon::legged_tasks::LeggedWeights;
 use delmpc_horizon::motion_plan::MotionPlan;
 use delmpc_horizon::motion_reference::{MotionReference, SwingShape};
@@ -39,7 +39,7 @@ use delmpc_messages::{
 };
 use nalgebra::Vector2;
 
-use crate::config::ControllerKind;
+use crate::config::{ConstraintConfig, ControllerKind};
 use crate::cycle::reason;
 use crate::errors::ControlError;
 use crate::fallback::{Attempt, FallbackConfig, FallbackLadder, Situation};
@@ -125,7 +125,7 @@ pub struct LeggedConfig {
     /// Weights of the tasks.
     pub weights: LeggedWeights,
     /// Limits of the plan.
-    pub limits: LeggedLimits,
+    pub limits: ConstraintConfig,
     /// How a foot swings.
     pub swing: SwingShape,
     /// By how much the robot crouches before it steps, m; 0: by its legs.

@@ -2,6 +2,8 @@
 
 use alloc::vec::Vec;
 
+pub use delmpc_horizon::limits::JointLimits;
+
 use delmpc_estimation::prelude::{EstimatorConfig, EstimatorModel};
 use delmpc_mechanics::reroot::Rerooted;
 use delmpc_mechanics::tree::KinematicTree;
@@ -17,19 +19,6 @@ pub struct BodyPoint {
     pub body: usize,
     /// Position in its link frame, m.
     pub position: Vector3<f64>,
-}
-
-/// Limits of one joint; infinite where there is none.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct JointLimits {
-    /// Lowest position, rad or m.
-    pub lower: f64,
-    /// Highest position, rad or m.
-    pub upper: f64,
-    /// Largest torque, N·m or N.
-    pub effort: f64,
-    /// Largest speed, rad/s or m/s.
-    pub velocity: f64,
 }
 
 /// What the robot's sensors tell of its base and feet, and where they sit; without it the stance foot is taken to be level and at rest.

@@ -9,6 +9,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use crate::contact_schedule::MAX_FEET;
 use crate::errors::HorizonError;
+use crate::limits::JointLimits;
 
 /// A foot.
 #[derive(Clone, Debug, PartialEq)]
@@ -36,19 +37,6 @@ impl FootShape {
     }
 }
 
-/// Limits of one joint; infinite where there is none.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct JointRange {
-    /// Lowest position, rad or m.
-    pub lower: f64,
-    /// Highest position, rad or m.
-    pub upper: f64,
-    /// Largest torque, N·m or N.
-    pub effort: f64,
-    /// Largest speed, rad/s or m/s.
-    pub velocity: f64,
-}
-
 /// The robot. Vectors over joints are in the order of the floating tree.
 #[derive(Clone, Debug)]
 pub struct LeggedModel {
@@ -57,7 +45,7 @@ pub struct LeggedModel {
     /// Its feet.
     pub feet: Vec<FootShape>,
     /// Limits of its joints.
-    pub limits: Vec<JointRange>,
+    pub limits: Vec<JointLimits>,
     /// How it stands, at rest, on level ground at height 0.
     pub posture: BoundaryState,
 }

@@ -29,48 +29,10 @@ use crate::errors::HorizonError;
 use crate::foot_cone::{FlatFoot, WrenchCone};
 use crate::legged_model::LeggedModel;
 use crate::legged_tasks::{LeggedTasks, LeggedWeights};
+use crate::limits::ConstraintConfig;
 use crate::motion_plan::MotionPlan;
 use crate::motion_reference::{MotionReference, Target};
 use crate::stage_grid::StageGrid;
-
-/// Limits of the plan.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct LeggedLimits {
-    /// Part of the effort limit the plan may use.
-    pub torque_fraction: f64,
-    /// Coefficient of friction counted on.
-    pub friction: f64,
-    /// Sides of the friction pyramid.
-    pub friction_sides: usize,
-    /// Distance of the pressure point from the sole's edges, m.
-    pub cop_margin_m: f64,
-    /// Yaw torque per normal force, m.
-    pub yaw_arm_m: f64,
-    /// Least normal force of a foot that stands as a part of the weight.
-    pub min_force_fraction: f64,
-    /// Cost per N beyond a cone (moments: per 0.1 N·m).
-    pub contact_penalty: f64,
-    /// Cost per rad beyond a joint's range.
-    pub position_penalty: f64,
-    /// Cost per rad/s beyond a joint's speed.
-    pub velocity_penalty: f64,
-}
-
-impl Default for LeggedLimits {
-    fn default() -> Self {
-        Self {
-            torque_fraction: 0.98,
-            friction: 0.6,
-            friction_sides: 8,
-            cop_margin_m: 0.003,
-            yaw_arm_m: 0.06,
-            min_force_fraction: 0.005,
-            contact_penalty: 1.0,
-            position_penalty: 1e4,
-            velocity_penalty: 1e3,
-        }
-    }
-}
 
 /// The problem and what filling it takes.
 #[derive(Debug)]
@@ -105,7 +67,7 @@ impl LeggedProblem {
         model: &LeggedModel,
         stages: usize,
         weights: LeggedWeights,
-        limits: &LeggedLimits,
+        limits: &ConstraintConfig,
     ) -> Result<Self, HorizonError> {
         model.check()?;
         let tree = &model.tree;

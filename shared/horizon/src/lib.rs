@@ -8,7 +8,7 @@
 //!
 //! | step | module | what |
 //! |---|---|---|
-//! | robot | [`legged_model`] | floating tree, feet, limits, posture |
+//! | robot | [`legged_model`], [`limits`] | floating tree, feet, limits, posture |
 //! | when and where | [`contact_schedule`], [`gait`], [`step_plan`], [`retiming`], [`ground_plane`], [`stage_grid`] | stances of every foot, switch times as stage boundaries |
 //! | aim | [`base_path`], [`mass_centre_plan`], [`leg_kinematics`], [`load_sharing`], [`motion_reference`] | where base and feet shall be, and which forces carry that |
 //! | stage | [`foot_cone`], [`motion_plan`], [`legged_tasks`], [`legged_problem`] | wrench rows, the nominal, costs and transitions |
@@ -36,6 +36,7 @@ pub mod leg_kinematics;
 pub mod legged_model;
 pub mod legged_problem;
 pub mod legged_tasks;
+pub mod limits;
 pub mod load_sharing;
 pub mod mass_centre_plan;
 pub mod motion_plan;
