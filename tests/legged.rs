@@ -40,10 +40,10 @@ fn stands(scenario: &str, overrides: &[&str]) -> Summary {
 
 #[test]
 fn atlas_takes_a_push_on_two_feet() {
-    let summary = stands("atlas_two_feet", &["duration_s=3.0"]);
+    let summary = stands("atlas_two_feet", &["duration_s=4.0"]);
     let robot = &summary.plant.as_ref().unwrap().robot;
     assert_eq!((feet(&summary).contact_sets_visited, feet(&summary).steps_taken), (1, 0));
-    assert!(robot.settle_time_s.is_none_or(|settled| settled < 3.0));
+    assert!(robot.settle_time_s.unwrap() < 2.5, "{:?}", robot.settle_time_s);
 }
 
 #[test]
