@@ -103,6 +103,18 @@ fn it_lands_from_starts_that_are_off() {
     stands(&with("robot.start.roll_rad=0.0175"));
 }
 
+/// 1.2 times the weight for 0.1 s: 33 mm of flight, in which every joint holds its place.
+#[test]
+fn it_lands_from_a_push_upwards_and_stands() {
+    stands(&[
+        "reach.start_s=100".to_owned(),
+        "push.start_s=0.5".to_owned(),
+        "push.direction=[0, 0, 1]".to_owned(),
+        "push.impulse_ns=206".to_owned(),
+        "duration_s=3.0".to_owned(),
+    ]);
+}
+
 #[test]
 fn the_estimate_is_good_with_a_biased_gyroscope_and_a_biased_attitude_is_survived() {
     let summary = run(&with("sensors.gyro_bias_rad_s=8.7e-3"));

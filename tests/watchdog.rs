@@ -88,3 +88,21 @@ fn no_rung_shakes_atlas_standing_or_sinking() {
 fn no_rung_shakes_the_lamp() {
     assert_calm("lamp", &silence("configs/examples/lamp/reach.toml", &[]));
 }
+
+/// LittleDog on four feet, standing and while a trot is under way.
+#[test]
+fn no_rung_shakes_littledog() {
+    assert_calm(
+        "standing",
+        &silence("configs/scenarios/littledog_trot.toml", &["gait.start_s=100", "gait.stop_s=200"]),
+    );
+    assert_calm("trotting", &silence("configs/scenarios/littledog_trot.toml", &["gait.start_s=0.05"]));
+}
+
+#[test]
+#[ignore = "needs a scenario of the caller's: DELMPC_WATCHDOG_SCENARIO"]
+fn no_rung_shakes_a_robot_of_the_callers() {
+    let scenario = std::env::var("DELMPC_WATCHDOG_SCENARIO").unwrap();
+    assert_calm("standing", &silence(&scenario, &[]));
+    assert_calm("sinking", &silence(&scenario, &["plant.ground_sink_m=2e-3"]));
+}

@@ -41,7 +41,7 @@ use crate::stop_watch::StopWatch;
 pub use crate::stop_watch::{Clock, StoppedClock};
 use crate::tasks::TaskTargets;
 use crate::telling::tell_constraints;
-use crate::unloaded_leg::UnloadedLeg;
+use crate::unloaded_robot::UnloadedRobot;
 use delmpc_horizon::foot_cone::{FlatFoot, WrenchCone};
 use delmpc_lq::dual_qp::QpSolver;
 use delmpc_lq::kernels::all_finite;
@@ -84,7 +84,7 @@ pub struct Controller {
     config: ControllerConfig,
 
     estimator: Estimator,
-    unloaded_leg: Option<UnloadedLeg>,
+    unloaded_robot: Option<UnloadedRobot>,
     ladder: FallbackLadder,
     reference: Reference,
     /// The reach as it was asked for, and how far from its goal the hand ends, m.
@@ -186,22 +186,15 @@ impl Controller {
         let samples = libm::round(RATE_MEAN_S / config.servo_period_s) as usize;
         command.rate_samples = samples.clamp(1, MAX_RATE_SAMPLES) as u32;
         let plan = Plan::new(Trajectory::new(size), &config.stage_lengths());
-        let unloaded_leg = match &model.sensing {
-            Some(sensing) => match sensing.rerooted.new_body(0) {
-                Some(base) => Some(UnloadedLeg::new(
-                    tree,
-                    sensing.stance_foot,
-                    base,
-                    &model.posture,
-                    config.servo_period_s,
-                )?),
-                None => None,
-            },
+        let unloaded_robot = match &model.sensing {
+            Some(sensing) => {
+                Some(UnloadedRobot::new(tree, sensing.stance_foot, &model.posture, config.servo_period_s)?)
+            }
             None => None,
         };
         let mut controller = Self {
             estimator: Estimator::new(&model)?,
-            unloaded_leg,
+            unloaded_robot,
             ladder: FallbackLadder::new(config.fallback),
             reference: Reference::at(home),
             asked_reach: None,

@@ -14,7 +14,7 @@
 //! Reading order: [`model`], [`config`], [`cycle`]; then in the order of the cycle [`estimator`], [`plan`], [`horizon_dynamics`],
 //! [`stage_dynamics`], [`node_kinematics`], [`tasks`], [`mod@reference`], [`contact_wrench`], the solver ([`delmpc_lq`]), [`fallback`].
 //! [`legged`] is the same cycle for a robot on any set of feet, on the horizons of [`delmpc_horizon`]. Files without public items:
-//! `feedback_law.rs` (what a command carries), `level_stance.rs` (a foot that is not level), `unloaded_leg.rs` (one that carries
+//! `feedback_law.rs` (what a command carries), `level_stance.rs` (a foot that is not level), `unloaded_robot.rs` (one that carries
 //! nothing), `balance_trim.rs` (wrong masses), `prediction.rs` (delay).
 #![allow(clippy::needless_range_loop)]
 #![cfg_attr(not(feature = "std"), no_std)]
@@ -46,7 +46,7 @@ pub mod stage_dynamics;
 mod stop_watch;
 pub mod tasks;
 mod telling;
-mod unloaded_leg;
+mod unloaded_robot;
 
 /// What a process needs to run a controller.
 pub mod prelude {

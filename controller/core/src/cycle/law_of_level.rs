@@ -80,10 +80,10 @@ impl Controller {
             // Never of a law of this model; what has been written holds for a foot that rests.
             return;
         }
-        if let Some(leg) = &self.unloaded_leg {
+        if let Some(robot) = &self.unloaded_robot {
             let Estimate { q, ground_lean, .. } = self.estimator.estimate();
             let level = self.estimator.told_by_gyroscope();
-            leg.write(level, q, (*ground_lean).into(), joints, &mut self.command);
+            robot.write(level, q, (*ground_lean).into(), joints, &mut self.command);
         }
     }
 

@@ -8,7 +8,7 @@
 //! its own small inertia is beyond the ankle: the same gains would spin it about its edge. So the servo blends from the plan's law to
 //! these by the load the foot carries. `w` times the servo's period is far below the 2 at which a sampled damper becomes unstable.
 //!
-//! Source: own formulation; as `unloaded_leg.rs` for a robot on one foot.
+//! Source: own formulation; as `unloaded_robot.rs` for a robot on one foot.
 
 use alloc::vec::Vec;
 
