@@ -10,6 +10,7 @@ use delmpc::one_process::{Simulated, simulate};
 use delmpc::setup::Setup;
 use delmpc::summary::Summary;
 use delmpc_controller_process::stop::StopFlag;
+use delmpc_scenario::FaultSettings;
 
 fn setup(scenario: &str, overrides: &[&str]) -> Setup {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("configs/scenarios/{scenario}.toml"));
@@ -19,8 +20,11 @@ fn setup(scenario: &str, overrides: &[&str]) -> Setup {
 }
 
 fn run(scenario: &str, overrides: &[&str]) -> Summary {
-    let setup = setup(scenario, overrides);
-    match simulate(&setup, Log::none(), &StopFlag::on_signals().unwrap()).unwrap() {
+    run_set_up(scenario, overrides, &setup(scenario, overrides))
+}
+
+fn run_set_up(scenario: &str, overrides: &[&str], setup: &Setup) -> Summary {
+    match simulate(setup, Log::none(), &StopFlag::on_signals().unwrap()).unwrap() {
         Simulated::Fault(why) => panic!("{scenario} {overrides:?}: {why}"),
         Simulated::Ended { plant, .. } => Summary::new(&setup.scenario, Some(*plant), None, None),
     }
@@ -55,6 +59,17 @@ fn atlas_walks() {
     assert!(figures.max_slip_m < 0.01, "{figures:?}");
 }
 
+/// Half of the commands do not arrive: the others' law carries the robot on, with its base felt by gyroscope and standing legs.
+#[test]
+fn atlas_walks_with_every_second_command_lost() {
+    let overrides = ["duration_s=3.0"];
+    let mut setup = setup("atlas_walk", &overrides);
+    setup.scenario.fault.push(FaultSettings { count: 100_000, probability: 0.5, ..FaultSettings::default() });
+    let summary = run_set_up("atlas_walk", &overrides, &setup);
+    assert!(!summary.plant.as_ref().unwrap().robot.fell, "{:?}", summary.failure);
+    assert!(feet(&summary).steps_taken >= 2);
+}
+
 #[test]
 fn littledog_trots_and_keeps_to_its_path() {
     let summary = stands("littledog_trot", &["duration_s=3.0"]);
@@ -87,6 +102,7 @@ fn seeds_slopes_masses_and_gaits() {
         "plant.slope_rad=[0.0, 0.05236]",
         "plant.ground_sink_m=0.7e-3",
         "plant.mass_scale=1.1",
+        "plant.mass_scale=0.9",
     ] {
         stands("atlas_walk", &[change]);
     }

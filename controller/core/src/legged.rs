@@ -35,9 +35,9 @@ use delmpc_lq::riccati::Riccati;
 use delmpc_lq::trajectory::Trajectory;
 use delmpc_mechanics::contact_stage::BoundaryState;
 use delmpc_messages::{
-    Command, CycleReport, FallbackLevel, MAX_JOINTS, MAX_RATE_SAMPLES, PlantState, Verdict,
+    Command, CycleReport, FallbackLevel, MAX_JOINTS, MAX_RATE_SAMPLES, PlantState, Verdict, sensor,
 };
-use nalgebra::Vector2;
+use nalgebra::{Vector2, Vector3};
 
 use crate::config::{ConstraintConfig, ControllerKind};
 use crate::cycle::reason;
@@ -47,11 +47,13 @@ use crate::feedback_law::Law;
 use crate::stop_watch::{Clock, StopWatch};
 use crate::telling::tell_constraints;
 
+mod base_feedback;
 mod law;
 mod light_feet;
 mod prediction;
 mod sensing;
 
+use base_feedback::BaseFeedback;
 use light_feet::LightFeet;
 use prediction::StatePrediction;
 use sensing::LeggedSensing;
@@ -180,12 +182,16 @@ pub struct LeggedController {
     measured: BoundaryState,
     predicted: BoundaryState,
     scratch: BoundaryState,
+    later: BoundaryState,
     law: Law,
+    base_feedback: BaseFeedback,
     light_feet: LightFeet,
     command: Command,
     blank_report: CycleReport,
     origin_ns: u64,
     last_state_ns: Option<u64>,
+    /// Sum of the gyroscope at that state.
+    imu_angle: Option<Vector3<f64>>,
     older_states: u32,
     last_sequence: u64,
 }
@@ -217,6 +223,8 @@ impl LeggedController {
         command.fallback_level = FallbackLevel::ZeroTorque as u32;
         let samples = libm::round(config.rate_mean_s / config.servo_period_s) as usize;
         command.rate_samples = samples.clamp(1, MAX_RATE_SAMPLES) as u32;
+        let (imu_body, imu) = (robot.estimator.imu_body, &robot.estimator.imu_mounting);
+        let base_feedback = BaseFeedback::new(&model.tree, imu_body, imu.rotation);
         Ok(Self {
             sensing: LeggedSensing::new(&robot)?,
             ladder: FallbackLadder::new(config.fallback),
@@ -240,12 +248,15 @@ impl LeggedController {
             measured: model.posture.clone(),
             predicted: model.posture.clone(),
             scratch: model.posture.clone(),
+            later: model.posture.clone(),
             law: Law::new(joints),
+            base_feedback,
             light_feet: LightFeet::new(model, config.servo_period_s)?,
             blank_report: command.report,
             command,
             origin_ns: 0,
             last_state_ns: None,
+            imu_angle: None,
             older_states: 0,
             last_sequence: 0,
             grid,
@@ -339,6 +350,8 @@ impl LeggedController {
         self.sensing.update(&self.robot.model, state).map_err(|_| reason::ESTIMATOR)?;
         self.last_state_ns = Some(state.time_ns);
         self.last_sequence = state.header.sequence;
+        let sums = state.has_sensor(sensor::INERTIAL_UNIT | sensor::INERTIAL_SUMS);
+        self.imu_angle = sums.then(|| state.imu_angle.into());
         if !self.placed {
             self.place(self.run_time_s(state.time_ns)).map_err(|_| reason::ESTIMATOR)?;
         }
@@ -452,8 +465,17 @@ impl LeggedController {
         if !self.has_plan || start_s - measured_s < 1e-6 {
             return Ok(());
         }
-        let Self { prediction, robot, plan, law, schedule, measured, predicted, .. } = self;
-        prediction.advance(&robot.model, plan, schedule, law, (measured_s, start_s), measured, predicted)?;
+        let Self { prediction, robot, plan, law, base_feedback, schedule, measured, predicted, .. } = self;
+        let feedback = (&*law, &*base_feedback);
+        prediction.advance(
+            &robot.model,
+            plan,
+            schedule,
+            feedback,
+            (measured_s, start_s),
+            measured,
+            predicted,
+        )?;
         Ok(())
     }
 

@@ -1,8 +1,9 @@
-//! The law a command carries: the plan's torques and joints, the joint part of the first gain, damping where there is no plan.
+//! The law a command carries: the plan's torques and joints, the first gain, damping where there is no plan.
 
-use delmpc_messages::{Command, FallbackLevel, LARGEST_EFFORT, PlantState};
+use delmpc_messages::{Command, FallbackLevel, LARGEST_EFFORT, MAX_FEET, MAX_JOINTS, PlantState};
 
 use super::LeggedController;
+use super::base_feedback::BaseFeedback;
 use crate::config::ControllerKind;
 use crate::feedback_law::{LawSegment, write_law};
 use crate::telling::state_estimate;
@@ -28,8 +29,10 @@ impl LeggedController {
             self.form_law(level, self.run_time_s(start_ns));
             self.command.fallback_level = level as u32;
             let begin_s = self.run_time_s(start_ns);
-            let Self { law, command, light_feet, schedule, .. } = self;
-            write(law, command);
+            write(&self.law, &mut self.command);
+            self.tell_base(begin_s);
+            self.allow_for_means();
+            let Self { command, light_feet, schedule, .. } = self;
             light_feet.write(|foot| schedule.stands(foot, begin_s), command);
             if command.validate(self.robot.joint_set_hash, joints).is_ok() {
                 if level > self.ladder.level() {
@@ -44,6 +47,29 @@ impl LeggedController {
         if self.last_state_ns.is_some() {
             let loaded = self.sensing.feet().iter().map(|foot| foot.loaded);
             self.command.estimate = state_estimate(self.sensing.base(), loaded);
+        }
+    }
+
+    /// The base's part of the law, where there is a gyroscope.
+    fn tell_base(&mut self, begin_s: f64) {
+        let (Some(angle), Some(last_ns)) = (self.imu_angle, self.last_state_ns) else { return };
+        let since_s = begin_s - self.run_time_s(last_ns);
+        self.plan.state_at(begin_s, &mut self.scratch);
+        let stage = self.plan.stage_at(begin_s);
+        let Self { robot, plan, sensing, schedule, base_feedback, command, scratch, .. } = self;
+        let mut shares = [0.0; MAX_FEET];
+        let mut row = 0;
+        for (foot, shape) in robot.model.feet.iter().enumerate() {
+            row += shape.contact().row_count();
+            if schedule.stands(foot, begin_s) && sensing.feet()[foot].loaded {
+                shares[foot] = plan.force(stage)[row - 1].max(0.0) / robot.model.weight_n();
+            }
+        }
+        let feet = robot.model.feet.len();
+        let measured = (&angle, sensing.base(), sensing.joints());
+        if base_feedback.write(&robot.model, scratch, &shares[..feet], measured, since_s, command).is_err() {
+            // Never of a plan of this model; the joints' columns hold for one cycle.
+            command.imu_gain = Default::default();
         }
     }
 
@@ -65,8 +91,9 @@ impl LeggedController {
 
     /// The stages of the plan from a time on, for as long as a command lives.
     fn form_law_of_plan(&mut self, time_s: f64) {
-        let Self { law, plan, scratch, .. } = self;
+        let Self { law, plan, scratch, later, base_feedback, robot, .. } = self;
         let joints = scratch.q.len();
+        let mut segments = 0;
         let end_s = time_s + self.config.command_life_s;
         let (first, stages) = (plan.stage_at(time_s), plan.stages());
         let mut from_s = time_s;
@@ -96,9 +123,14 @@ impl LeggedController {
             for j in 0..joints {
                 segment.acceleration[j] = (segment.acceleration[j] - scratch.rate[j]) / length_s;
             }
+            plan.state_at(from_s + BaseFeedback::MOMENT_S, later);
+            // Never an error for states of this model; without its turning a segment has the last one's.
+            let _ = base_feedback.take_turning(&robot.model.tree, segments, scratch, later);
+            segments += 1;
             from_s = until_s;
         }
         let gain = self.riccati.gain(first);
+        base_feedback.take_gain(gain);
         let nv = 6 + joints;
         for i in 0..joints {
             for j in 0..joints {
@@ -106,27 +138,29 @@ impl LeggedController {
                 law.gain[(i, joints + j)] = gain[(i, nv + 6 + j)];
             }
         }
-        self.allow_for_means();
     }
 
     /// The servo's velocities are means over its last samples: in a motion they are behind the reference by half of their time.
     fn allow_for_means(&mut self) {
         let samples = self.command.rate_samples.saturating_sub(1);
         let lag_s = 0.5 * f64::from(samples) * self.config.servo_period_s;
-        let (segments, gain) = self.law.segments_and_gain();
-        for segment in segments {
-            let joints = segment.torque.len();
-            for i in 0..joints {
-                let missing: f64 =
-                    (0..joints).map(|j| gain[(i, joints + j)] * lag_s * segment.acceleration[j]).sum();
-                segment.torque[i] += missing;
+        let Self { command, robot, .. } = self;
+        let (gain, imu_gain) = (&command.gain, &command.imu_gain);
+        for segment in &mut command.segments[..command.n_segments as usize] {
+            for (i, limit) in robot.model.limits.iter().enumerate() {
+                let on_rate = &gain[i][MAX_JOINTS..];
+                let joints = on_rate.iter().zip(&segment.acceleration_ref).map(|(k, a)| k * a).sum::<f64>();
+                let imu = imu_gain[i][3..].iter().zip(&segment.imu_acceleration_ref).map(|(k, a)| k * a);
+                let effort = limit.effort.min(LARGEST_EFFORT);
+                let torque = segment.torque[i] + lag_s * (joints + imu.sum::<f64>());
+                segment.torque[i] = torque.clamp(-effort, effort);
             }
         }
     }
 
     /// The torque that carries the aim, with damping; damping; nothing.
     fn form_passive_law(&mut self, level: FallbackLevel) {
-        let Self { law, reference, robot, measured, .. } = self;
+        let Self { law, reference, robot, measured, base_feedback, .. } = self;
         let joints = measured.q.len();
         let segment = law.restart();
         segment.torque.fill(0.0);
@@ -136,6 +170,7 @@ impl LeggedController {
             segment.torque.copy_from_slice(&reference.target(0).torque);
         }
         law.gain.fill(0.0);
+        base_feedback.clear();
         if level != FallbackLevel::ZeroTorque {
             for (j, limit) in robot.model.limits.iter().enumerate() {
                 let damping = DAMPING_FRACTION * limit.effort / limit.velocity;

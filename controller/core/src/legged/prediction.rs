@@ -13,6 +13,7 @@ use delmpc_mechanics::contact_stage::{BoundaryState, ContactStage, LiftedStage, 
 use delmpc_mechanics::errors::StepError;
 use delmpc_mechanics::lobatto::LobattoRule;
 
+use super::base_feedback::BaseFeedback;
 use crate::errors::ControlError;
 use crate::feedback_law::Law;
 
@@ -63,7 +64,7 @@ impl StatePrediction {
         model: &LeggedModel,
         plan: &MotionPlan,
         schedule: &ContactSchedule,
-        law: &Law,
+        (law, base_feedback): (&Law, &BaseFeedback),
         (from_s, to_s): (f64, f64),
         measured: &BoundaryState,
         predicted: &mut BoundaryState,
@@ -84,10 +85,12 @@ impl StatePrediction {
         let joints = self.input.len();
         let nv = 6 + joints;
         for _ in 0..ROUNDS {
+            let mean = |at: usize| 0.5 * (self.deviation[at] + self.later[at]);
+            let place: [f64; 6] = core::array::from_fn(mean);
+            let velocity: [f64; 6] = core::array::from_fn(|k| mean(nv + k));
             for (i, input) in self.input.iter_mut().enumerate() {
-                *input = 0.0;
+                *input = base_feedback.torque(i, &place, &velocity);
                 for j in 0..joints {
-                    let mean = |at: usize| 0.5 * (self.deviation[at] + self.later[at]);
                     *input += law.gain[(i, j)] * mean(6 + j) + law.gain[(i, joints + j)] * mean(nv + 6 + j);
                 }
                 let limit = model.limits[i].effort;

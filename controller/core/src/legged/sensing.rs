@@ -90,6 +90,11 @@ impl LeggedSensing {
         &self.feet
     }
 
+    /// Joints at the last measurement.
+    pub fn joints(&self) -> &[f64] {
+        &self.joints.0
+    }
+
     pub fn base(&self) -> &BaseEstimate {
         self.estimator.estimate()
     }
