@@ -50,6 +50,12 @@ fn atlas_takes_a_push_on_two_feet() {
     assert!(robot.settle_time_s.unwrap() < 2.5, "{:?}", robot.settle_time_s);
 }
 
+/// More than the pressure points of both feet could stop: the trunk has to help, and the end of the horizon must not forget it.
+#[test]
+fn atlas_takes_on_two_feet_what_its_soles_alone_could_not_stop() {
+    stands("atlas_two_feet", &["duration_s=3.5", "push.impulse_ns=75", "push.direction=[1, 0, 0]"]);
+}
+
 #[test]
 fn atlas_walks() {
     let summary = stands("atlas_walk", &["duration_s=3.6"]);
@@ -103,8 +109,16 @@ fn seeds_slopes_masses_and_gaits() {
         "plant.ground_sink_m=0.7e-3",
         "plant.mass_scale=1.1",
         "plant.mass_scale=0.9",
+        "plant.slope_rad=[0.0, -0.05236]",
     ] {
         stands("atlas_walk", &[change]);
+    }
+    for towards in ["[1, 0, 0]", "[-1, 0, 0]", "[0, 1, 0]", "[0, -1, 0]"] {
+        let direction = format!("push.direction={towards}");
+        stands("atlas_two_feet", &[&direction, "push.impulse_ns=75"]);
+        let in_single_support = ["push.link=utorso", "push.impulse_ns=15", "push.start_s=3.35"];
+        let push: Vec<&str> = in_single_support.iter().copied().chain([direction.as_str()]).collect();
+        stands("atlas_walk", &push);
     }
     for gait in [["gait.kind=walk", "gait.speed_m_s=0.1"], ["gait.kind=bound", "gait.speed_m_s=0.1"]] {
         stands("littledog_trot", &["gait.yaw_rate_rad_s=0.0", gait[0], gait[1]]);

@@ -183,6 +183,8 @@ pub struct LeggedController {
     predicted: BoundaryState,
     scratch: BoundaryState,
     later: BoundaryState,
+    /// Local coordinates of a state.
+    way: Vec<f64>,
     law: Law,
     base_feedback: BaseFeedback,
     light_feet: LightFeet,
@@ -249,6 +251,7 @@ impl LeggedController {
             predicted: model.posture.clone(),
             scratch: model.posture.clone(),
             later: model.posture.clone(),
+            way: vec![0.0; 2 * model.tree.dof()],
             law: Law::new(joints),
             base_feedback,
             light_feet: LightFeet::new(model, config.servo_period_s)?,
@@ -479,24 +482,30 @@ impl LeggedController {
         Ok(())
     }
 
-    /// The last plan on the new grid, its first boundary where the robot will be; what lies beyond it is the aim.
+    /// The last plan on the new grid, its first boundary where the robot will be; what lies beyond it is the aim. Without a plan to
+    /// follow, a way from there to the aim.
     fn resample(&mut self) {
         let follows = self.has_plan && !self.is_astray;
-        let Self { plan, nominal, grid, reference, problem, scratch, .. } = self;
+        let Self { plan, nominal, grid, reference, problem, predicted, scratch, way, .. } = self;
         let stages = grid.stages();
         nominal.times.copy_from_slice(grid.times());
         for k in 0..=stages {
             let (time_s, target) = (grid.times()[k], reference.target(k));
             let state = &mut nominal.states[k];
-            match follows && time_s <= plan.end_s() {
-                true => {
-                    plan.state_at(time_s, scratch);
-                    state.copy_from(scratch);
-                }
-                false => state.copy_from(&target.state),
+            if follows && time_s <= plan.end_s() {
+                plan.state_at(time_s, scratch);
+                state.copy_from(scratch);
+            } else if follows {
+                state.copy_from(&target.state);
+            } else {
+                let part = k as f64 / stages as f64;
+                predicted.local(&target.state, way);
+                way.iter_mut().for_each(|x| *x *= part * part * (3.0 - 2.0 * part));
+                state.copy_from(predicted);
+                state.retract(way);
             }
         }
-        nominal.states[0].copy_from(&self.predicted);
+        nominal.states[0].copy_from(predicted);
         let stage = problem.contact_stage();
         for k in 0..stages {
             let (middle, target) = (0.5 * (grid.times()[k] + grid.times()[k + 1]), reference.target(k));
@@ -513,18 +522,26 @@ impl LeggedController {
         }
     }
 
-    /// The solution becomes the plan, unless it is out of reach of the linearisation.
+    /// The solution becomes the plan, unless its first part is out of reach of the linearisation; what is so later on is shortened.
     fn adopt_plan(&mut self) -> Result<(), u32> {
         let positions = 6 + self.robot.model.tree.joint_count();
-        if (0..=self.solution.stages()).any(|k| largest(&self.solution.x(k)[..positions]) > LARGEST_MOVE) {
-            self.is_astray = true;
-            return Err(reason::FAR);
+        let stages = self.solution.stages();
+        for k in 0..=stages {
+            let x = self.solution.x_mut(k);
+            let size = largest(&x[..positions]);
+            if size > LARGEST_MOVE {
+                if k <= stages / 2 {
+                    self.is_astray = true;
+                    return Err(reason::FAR);
+                }
+                x.iter_mut().for_each(|x| *x *= LARGEST_MOVE / size);
+            }
         }
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-        for k in 0..=self.solution.stages() {
+        for k in 0..=stages {
             self.nominal.states[k].retract(self.solution.x(k));
         }
-        for k in 0..self.solution.stages() {
+        for k in 0..stages {
             let (u, x) = (self.solution.u(k), self.solution.x(k));
             self.nominal.input_mut(k).iter_mut().zip(u).for_each(|(input, u)| *input += u);
             let stage = &self.problem.problem.stages[k];

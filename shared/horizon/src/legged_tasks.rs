@@ -71,7 +71,7 @@ impl Default for LeggedWeights {
             tangential_force: 200.0,
             normal_force: 8.0,
             sole_torque: 200.0,
-            terminal_s: 0.15,
+            terminal_s: 0.5,
         }
     }
 }

@@ -199,7 +199,7 @@ impl Default for LeggedSettings {
             tangential_force_per_weight2: 200.0,
             normal_force_per_weight2: 8.0,
             sole_torque_per_weight2: 200.0,
-            terminal_s: 0.15,
+            terminal_s: 0.5,
             swing_lift_m: 0.0,
             swing_depth_m: 0.0,
             crouch_m: 0.0,
