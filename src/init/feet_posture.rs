@@ -23,7 +23,7 @@ use nalgebra::{DVector, Matrix3, Vector2, Vector3};
 
 use crate::init::feet::{FoundFoot, centroid, hull};
 use crate::init::gauss_newton::least_squares;
-use crate::init::posture::{LEG_MARGIN, ONE_SIDED, OTHER_MARGIN, Standing, kept, lean};
+use crate::init::posture::{LEG_MARGIN, OTHER_MARGIN, Standing, kept, lean};
 
 const FOOT_HEIGHT: f64 = 1000.0;
 const FOOT_LEAN: f64 = 300.0;
@@ -39,6 +39,8 @@ const BENT_ON_TIPS: f64 = 0.75;
 /// How far a knee is bent, where it may be: on soles, on tips, rad.
 const KNEE: f64 = 0.6;
 const KNEE_ON_TIPS: f64 = 1.2;
+/// The middle of a knee's range is this part of it away from straight: it bends to that side.
+const ONE_SIDED: f64 = 0.25;
 /// An axis this near to the lateral one turns the leg forward and back.
 const LATERAL: f64 = 0.8;
 /// Off by this much (m, rad) is not standing.
@@ -281,7 +283,7 @@ fn rather(
         let [(hip, hip_sign), (bend, bend_sign), ..] = pitch[..] else { continue };
         let (lower, upper) = ranges[bend];
         // Stops tell how it bends; without them the knee goes behind the hip on tips, and before it on soles, as people's do.
-        let side = match lower.max(-upper) > -ONE_SIDED {
+        let side = match (lower + upper).abs() > ONE_SIDED * (upper - lower) {
             true => (lower + upper).signum(),
             false if on_tips => -bend_sign,
             false => bend_sign,

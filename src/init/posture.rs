@@ -34,7 +34,7 @@ pub const OTHER_MARGIN: f64 = 0.25;
 /// Height of the root link over the soles, as a part of that with all joints at zero.
 const BENT: f64 = 0.95;
 /// A joint of a leg that goes less than this beyond 0 to one side is a knee, and where it would rather be, rad.
-pub const ONE_SIDED: f64 = 0.2;
+const ONE_SIDED: f64 = 0.2;
 const KNEE: f64 = 0.6;
 /// How high the other foot hangs, as a part of that height.
 const LIFT: f64 = 0.06;

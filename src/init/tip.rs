@@ -1,16 +1,20 @@
-//! The end of a foot without a flat sole: a sphere among its shapes, else the one that fits the lowest points of its meshes.
+//! The end of a foot without a flat sole: a sphere among its shapes, else the round one that fits the lowest points of its meshes.
 
 use delmpc_mechanics::prelude::RigidTransform;
-use nalgebra::{DMatrix, DVector, Vector2, Vector3};
+use nalgebra::{Matrix3, Vector2, Vector3};
+
+use crate::init::feet::hull;
 
 /// A sphere that ends this much above the lowest point is the foot all the same: shanks are drawn into their feet, m.
 const SUNK_M: f64 = 0.015;
 /// Heights above the lowest point that may belong to the tip, m: the first ones that a sphere fits.
 const DEPTH_M: [f64; 4] = [0.004, 0.008, 0.016, 0.03];
-/// A sphere fits that is off by no more than this part of its radius (root mean square) ...
+/// A circle fits that is off by no more than this part of its radius (root mean square) ...
 const FITS: f64 = 0.05;
 /// ... and is no larger, m.
 const LARGEST_M: f64 = 0.1;
+/// Fewer points of an outline are corners, not a circle.
+const FEWEST_POINTS: usize = 5;
 
 /// A sphere that touches the ground; a point where the radius is 0.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -42,51 +46,45 @@ pub fn tip(points_w: &[Vector3<f64>], spheres_w: &[Tip]) -> Tip {
     let near = |depth: f64| -> Vec<Vector3<f64>> {
         points_w.iter().filter(|point| point.z - lowest_point.z <= depth).copied().collect()
     };
-    let fitted = DEPTH_M.iter().find_map(|depth| sphere(&near(*depth)).or_else(|| cylinder(&near(*depth))));
+    let fitted = DEPTH_M.iter().find_map(|depth| round(&near(*depth)));
     fitted.unwrap_or(Tip { centre: lowest_point, radius: 0.0 })
 }
 
-/// The sphere through points: `|p|² = 2 c.p + k` in the least squares (Kåsa's fit).
-fn sphere(points: &[Vector3<f64>]) -> Option<Tip> {
-    let rows: Vec<Vec<f64>> = points.iter().map(|point| point.iter().copied().collect()).collect();
-    let (centre, radius) = round(&rows)?;
-    Some(Tip { centre: Vector3::new(centre[0], centre[1], centre[2]), radius })
+/// The sphere, or the cylinder across the direction of walking, whose outline from the side is that of the points. Of the points only the
+/// outline counts: feet have rounded edges.
+fn round(points: &[Vector3<f64>]) -> Option<Tip> {
+    let outline = hull(&points.iter().map(Vector3::xz).collect::<Vec<_>>());
+    // Not the chord above.
+    let top = outline.iter().map(|point| point.y).fold(f64::NEG_INFINITY, f64::max);
+    let bottom = outline.iter().map(|point| point.y).fold(f64::INFINITY, f64::min);
+    let below: Vec<Vector2<f64>> =
+        outline.into_iter().filter(|point| point.y <= bottom + 0.999 * (top - bottom)).collect();
+    let (centre, radius) = circle(&below)?;
+    let sides = || points.iter().map(|point| point.y);
+    let middle = 0.5 * (sides().fold(f64::INFINITY, f64::min) + sides().fold(f64::NEG_INFINITY, f64::max));
+    Some(Tip { centre: Vector3::new(centre.x, middle, centre.y), radius })
 }
 
-/// The cylinder across the direction of walking.
-fn cylinder(points: &[Vector3<f64>]) -> Option<Tip> {
-    let rows: Vec<Vec<f64>> = points.iter().map(|point| vec![point.x, point.z]).collect();
-    let (centre, radius) = round(&rows)?;
-    let sides = points.iter().map(|point| point.y);
-    let span = Vector2::new(sides.clone().fold(f64::INFINITY, f64::min), sides.fold(f64::NEG_INFINITY, f64::max));
-    Some(Tip { centre: Vector3::new(centre[0], 0.5 * span.sum(), centre[1]), radius })
-}
-
-/// Centre and radius of a circle or sphere that fits, below its centre.
-fn round(points: &[Vec<f64>]) -> Option<(Vec<f64>, f64)> {
-    let (count, axes) = (points.len(), points.first()?.len());
-    if count < 2 * axes + 2 {
+/// Centre and radius of the circle through points, `|p|² = 2 c.p + k` in the least squares (Kåsa's fit), if it fits.
+fn circle(points: &[Vector2<f64>]) -> Option<(Vector2<f64>, f64)> {
+    if points.len() < FEWEST_POINTS {
         return None;
     }
     // About their middle, where the numbers are of the size of the foot.
-    let middle: Vec<f64> =
-        (0..axes).map(|axis| points.iter().map(|point| point[axis]).sum::<f64>() / count as f64).collect();
-    let matrix = DMatrix::from_fn(count, axes + 1, |row, column| match column < axes {
-        true => 2.0 * (points[row][column] - middle[column]),
-        false => 1.0,
-    });
-    let squares = |point: &Vec<f64>| (0..axes).map(|axis| (point[axis] - middle[axis]).powi(2)).sum::<f64>();
-    let right = DVector::from_iterator(count, points.iter().map(squares));
-    let solved = matrix.svd(true, true).solve(&right, 1e-12).ok()?;
-    let radius = (solved[axes] + (0..axes).map(|axis| solved[axis].powi(2)).sum::<f64>()).sqrt();
-    let centre: Vec<f64> = (0..axes).map(|axis| solved[axis] + middle[axis]).collect();
-    let off = |point: &Vec<f64>| {
-        let distance = (0..axes).map(|axis| (point[axis] - centre[axis]).powi(2)).sum::<f64>().sqrt();
-        (distance - radius).powi(2)
-    };
-    let error = (points.iter().map(off).sum::<f64>() / count as f64).sqrt();
-    (radius.is_finite() && radius <= LARGEST_M && error <= FITS * radius && centre[axes - 1] > middle[axes - 1])
-        .then_some((centre, radius))
+    let middle = points.iter().sum::<Vector2<f64>>() / points.len() as f64;
+    let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());
+    for point in points.iter().map(|point| point - middle) {
+        let row = (2.0 * point).push(1.0);
+        normal += row * row.transpose();
+        right += row * point.norm_squared();
+    }
+    let solved = normal.lu().solve(&right)?;
+    let centre = solved.xy() + middle;
+    let radius = (solved.z + solved.xy().norm_squared()).sqrt();
+    let square = |point: &Vector2<f64>| ((point - centre).norm() - radius).powi(2);
+    let error = (points.iter().map(square).sum::<f64>() / points.len() as f64).sqrt();
+    let fits = radius <= LARGEST_M && error <= FITS * radius && centre.y > middle.y;
+    fits.then_some((centre, radius))
 }
 
 #[cfg(test)]
