@@ -3,12 +3,13 @@
 //! | file | what it does |
 //! |---|---|
 //! | [`feet`], [`tip`] | soles and tips of feet from shapes |
-//! | [`posture`], [`feet_posture`] | a posture on one sole, on several feet |
+//! | [`posture`], [`feet_posture`], [`arm_posture`] | a posture on one sole, on several feet, bolted down |
 //! | [`gauss_newton`] | what solves for it |
 //! | [`files`], [`scenario_text`] | the texts of the two files |
 //!
 //! What `init` writes runs as it is; the files are the user's from then on.
 
+pub mod arm_posture;
 pub mod feet;
 pub mod feet_posture;
 pub mod files;
@@ -21,11 +22,11 @@ use std::path::{Path, PathBuf};
 
 use delmpc_messages::MAX_JOINTS;
 use delmpc_robots::{
-    Companion, ImpossibleInertia, LoadOptions, RobotError, RobotModel, Rule, load_str, load_with,
+    BaseChoice, Companion, ImpossibleInertia, LoadOptions, RobotError, RobotModel, Rule, load_str, load_with,
 };
 
 use crate::check::weightless_joints;
-use crate::init::feet::{FoundFoot, find_feet};
+use crate::init::feet::{FoundFoot, NoFeet, find_feet};
 use crate::init::files::Table;
 use crate::init::scenario_text::{Size, Support, scenario_text};
 use crate::output::{line, say};
@@ -123,10 +124,27 @@ pub fn init(arguments: &InitArguments) -> Result<Ended, Failure> {
 struct Made {
     robot: RobotModel,
     table: String,
-    /// The one it stands on; nothing: all.
-    sole: Option<String>,
+    stands: Stands,
     size: Size,
     warnings: Vec<String>,
+}
+
+/// What it stands on.
+enum Stands {
+    OnSole(String),
+    OnAllFeet,
+    /// Bolted down; its hand.
+    Bolted(arm_posture::Hand),
+}
+
+impl Stands {
+    fn support(&self) -> Support<'_> {
+        match self {
+            Self::OnSole(sole) => Support::Sole(sole),
+            Self::OnAllFeet => Support::AllFeet,
+            Self::Bolted(_) => Support::Bolted,
+        }
+    }
 }
 
 fn make(urdf: &Path, text: &str, stand: Option<Stand>) -> Result<Made, Failure> {
@@ -140,7 +158,11 @@ fn make(urdf: &Path, text: &str, stand: Option<Stand>) -> Result<Made, Failure> 
     let load = |table: &Table| load_str(urdf, text, Some(&table.text()), &options).map_err(Failure::input);
     lock_joints(&bare, &mut table);
     let robot = load(&table)?;
-    table.feet = find_feet(&robot).map_err(|why| named(why.to_string()))?;
+    table.feet = match find_feet(&robot) {
+        Ok(feet) => feet,
+        Err(NoFeet::Fixed) => return bolted(urdf, text, stand, table, &robot),
+        Err(why) => return Err(named(why.to_string())),
+    };
     lock_most(&robot, &mut table);
     let sole = stance(&table.feet, stand).map_err(named)?;
     let robot = load(&table)?;
@@ -153,11 +175,43 @@ fn make(urdf: &Path, text: &str, stand: Option<Stand>) -> Result<Made, Failure> 
     feet_posture::place_tips(&robot, &standing, &mut table.feet).map_err(|error| named(error.to_string()))?;
     table.posture = Some((standing.clone(), robot.joint_names.clone()));
     let robot = load(&table)?;
-    let support = sole.as_deref().map_or(Support::AllFeet, Support::Sole);
-    let size = Size::of(&robot, support, &standing);
+    let stands = sole.map_or(Stands::OnAllFeet, Stands::OnSole);
+    let size = Size::of(&robot, stands.support(), &standing);
     let mut warnings = robot.warnings.clone();
     warnings.extend(table.notes.iter().cloned());
-    Ok(Made { table: table.text(), robot, sole, size, warnings })
+    Ok(Made { table: table.text(), robot, stands, size, warnings })
+}
+
+/// A robot without feet.
+fn bolted(
+    urdf: &Path,
+    text: &str,
+    stand: Option<Stand>,
+    mut table: Table,
+    found: &RobotModel,
+) -> Result<Made, Failure> {
+    let named = |why: String| Failure::Input(format!("{}: {why}", urdf.display()));
+    if stand.is_some() {
+        return Err(named(format!("--stand: {}", NoFeet::Fixed)));
+    }
+    let base = match found.tree.is_floating() {
+        true => BaseChoice::Fixed(found.body_names.first().cloned().unwrap_or_default()),
+        false => BaseChoice::Auto,
+    };
+    let options = LoadOptions { base, ..LoadOptions::default() };
+    lock_most(found, &mut table);
+    let load = |table: &Table| load_str(urdf, text, Some(&table.text()), &options).map_err(Failure::input);
+    let robot = load(&table)?;
+    let hand = arm_posture::hand(&robot).ok_or_else(|| named("it has no joint that moves".to_owned()))?;
+    table.is_bolted = true;
+    table.hands = vec![hand.clone()];
+    let standing = arm_posture::bolted(&robot, &hand).map_err(named)?;
+    table.posture = Some((standing.clone(), robot.joint_names.clone()));
+    let robot = load(&table)?;
+    let size = Size::of_arm(&robot, &hand.0, &standing);
+    let mut warnings = robot.warnings.clone();
+    warnings.extend(table.notes.iter().cloned());
+    Ok(Made { table: table.text(), robot, stands: Stands::Bolted(hand), size, warnings })
 }
 
 /// Without a table, with impossible inertias accepted where it has to be.
@@ -240,7 +294,11 @@ fn stance(feet: &[FoundFoot], stand: Option<Stand>) -> Result<Option<String>, St
         Some(Stand::All) if feet.len() > 1 => return Ok(None),
         Some(Stand::Both) if feet.len() == 2 => return Ok(None),
         Some(Stand::Both) => {
-            return Err(format!("--stand both: the robot has not two feet, but {} ({})", feet.len(), names()));
+            return Err(format!(
+                "--stand both: the robot has not two feet, but {} ({})",
+                feet.len(),
+                names()
+            ));
         }
         Some(Stand::Left) => "left",
         None | Some(Stand::Right | Stand::All) => "right",
@@ -249,7 +307,10 @@ fn stance(feet: &[FoundFoot], stand: Option<Stand>) -> Result<Option<String>, St
     let sole = only.or_else(|| feet.iter().find(|foot| foot.name == wanted));
     match sole {
         Some(foot) if foot.tip.is_none() => Ok(Some(foot.name.clone())),
-        _ => Err(format!("the robot has the feet {}, and no sole `{wanted}` to stand on alone: --stand all", names())),
+        _ => Err(format!(
+            "the robot has the feet {}, and no sole `{wanted}` to stand on alone: --stand all",
+            names()
+        )),
     }
 }
 
@@ -260,11 +321,16 @@ fn with_a_ball(
     stem: &str,
     write: impl Fn(&Path, &str) -> Result<(), Failure>,
 ) -> Result<String, Failure> {
-    let Made { robot, sole, size, .. } = made;
-    let support = sole.as_deref().map_or(Support::AllFeet, Support::Sole);
+    let Made { robot, stands, size, .. } = made;
+    let support = stands.support();
     let without = scenario_text(robot, stem, support, size, None);
-    // On several feet the controller has no task for hands.
-    for (hand, at) in sole.iter().flat_map(|sole| files::hands_at_home(robot, sole)) {
+    let hands = match stands {
+        Stands::OnSole(sole) => files::hands_at_home(robot, sole),
+        // The controller has no task for hands there.
+        Stands::OnAllFeet => Vec::new(),
+        Stands::Bolted((hand, ..)) => vec![(hand.clone(), size.hand.into())],
+    };
+    for (hand, at) in hands {
         for direction in [[1.0, 0.0, 0.0], [0.7, 0.0, 0.7], [0.0, 0.0, 1.0], [0.7, 0.0, -0.7]] {
             let ball: [f64; 3] = std::array::from_fn(|axis| at[axis] + REACH_M * direction[axis]);
             let text = scenario_text(robot, stem, support, size, Some((&hand, ball)));

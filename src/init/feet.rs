@@ -22,8 +22,8 @@ const SOLE_PART: f64 = 0.4;
 /// Corners of a sole are left out as long as it loses no more than this part of its area.
 const LOST_AREA: f64 = 0.04;
 const MOST_CORNERS: usize = 8;
-/// Soles nearer than this to their ankles say nothing of where the front is, m.
-const NO_HEADING_M: f64 = 0.005;
+/// Soles whose middles are nearer to their ankles than this part of their length say nothing of where the front is.
+const NO_HEADING: f64 = 0.1;
 /// Points around a round shape.
 const AROUND: usize = 16;
 
@@ -56,15 +56,17 @@ pub enum NoFeet {
     )]
     NoShapes,
     /// Feet without a flat sole, too few to stand on.
-    #[error("{count} feet without a flat sole ({links}): a robot stands on one flat sole, or on three tips and more")]
+    #[error(
+        "{count} feet without a flat sole ({links}): a robot stands on one flat sole, or on three tips and more"
+    )]
     Points {
         /// How many.
         count: usize,
         /// Links that carry them.
         links: String,
     },
-    /// The robot is fixed to the world.
-    #[error("this robot is fixed to the world and needs no sole")]
+    /// The robot is fixed to the world, or stands on its root link.
+    #[error("this robot has no feet: it is bolted down and needs no sole")]
     Fixed,
     /// The tree cannot be posed.
     #[error(transparent)]
@@ -101,6 +103,14 @@ pub fn find_feet(robot: &RobotModel) -> Result<Vec<FoundFoot>, NoFeet> {
     let heights = || clouds.iter().flat_map(|cloud| cloud.points_w.iter().map(|point| point.z));
     let lowest = heights().fold(f64::INFINITY, f64::min);
     let highest = poses.iter().map(|pose| pose.translation.z).chain(heights()).fold(lowest, f64::max);
+    // An arm stands on its root link.
+    let on_root =
+        cloud(robot, 0, &poses[0]).is_some_and(|root| root.points_w.iter().any(|point| point.z < lowest));
+    let centre = |body: usize| poses[body].transform_point(&robot.tree.bodies()[body].inertia.com).z;
+    let is_lowest = (0..poses.len()).all(|body| centre(body) >= centre(0));
+    if on_root || is_lowest {
+        return Err(NoFeet::Fixed);
+    }
     if clouds.is_empty() {
         return Err(NoFeet::NoShapes);
     }
@@ -122,21 +132,20 @@ pub fn find_feet(robot: &RobotModel) -> Result<Vec<FoundFoot>, NoFeet> {
     // Toes are farther from the ankle than heels, and the sides of two feet cancel each other.
     let ahead: Vector2<f64> =
         soles.iter().map(|(cloud, sole)| sole.middle - poses[cloud.body].translation.xy()).sum();
-    let forward = heading(&ahead);
+    let long: f64 = soles.iter().map(|(_, sole)| sole.longest()).sum();
+    let forward = heading(&ahead, NO_HEADING * long);
     let mut feet: Vec<(Vector2<f64>, FoundFoot)> = soles
         .iter()
-        .filter_map(|(cloud, sole)| Some((sole.middle, foot(robot, cloud, sole, &forward, &poses[cloud.body])?)))
+        .filter_map(|(cloud, sole)| {
+            Some((sole.middle, foot(robot, cloud, sole, &forward, &poses[cloud.body])?))
+        })
         .collect();
     name_feet(&mut feet, &forward);
     Ok(feet.into_iter().map(|(_, foot)| foot).collect())
 }
 
 /// Feet that stand on their tips; x of the root link is forward.
-fn tips(
-    robot: &RobotModel,
-    standing: &[&Cloud],
-    poses: &[RigidTransform],
-) -> Result<Vec<FoundFoot>, NoFeet> {
+fn tips(robot: &RobotModel, standing: &[&Cloud], poses: &[RigidTransform]) -> Result<Vec<FoundFoot>, NoFeet> {
     if standing.len() < FEWEST_TIPS {
         let links: Vec<&str> = standing.iter().map(|cloud| robot.body_names[cloud.body].as_str()).collect();
         return Err(NoFeet::Points { count: links.len(), links: links.join(", ") });
@@ -180,9 +189,9 @@ fn name_feet(feet: &mut [(Vector2<f64>, FoundFoot)], forward: &Vector2<f64>) {
     }
 }
 
-/// The axis of the root link nearest to a direction; x when there is none.
-fn heading(ahead: &Vector2<f64>) -> Vector2<f64> {
-    if ahead.norm() < NO_HEADING_M {
+/// The axis of the root link nearest to a direction; x where it says little.
+fn heading(ahead: &Vector2<f64>, little: f64) -> Vector2<f64> {
+    if ahead.norm() < little {
         Vector2::x()
     } else if ahead.x.abs() >= ahead.y.abs() {
         Vector2::new(ahead.x.signum(), 0.0)
@@ -264,6 +273,14 @@ struct Sole {
     corners: Vec<Vector2<f64>>,
     middle: Vector2<f64>,
     height: f64,
+}
+
+impl Sole {
+    /// Distance of its farthest corners, m.
+    fn longest(&self) -> f64 {
+        let pairs = self.corners.iter().flat_map(|a| self.corners.iter().map(move |b| (a - b).norm()));
+        pairs.fold(0.0, f64::max)
+    }
 }
 
 fn sole(cloud: &Cloud) -> Option<Sole> {

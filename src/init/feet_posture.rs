@@ -88,7 +88,11 @@ pub fn stand_on_feet(robot: &RobotModel, feet: &[FoundFoot]) -> Result<Standing,
     let (base_link, com) = problem.pose(&solved);
     let origin = Vector3::new(problem.support.x, problem.support.y, 0.0);
     let moved = RigidTransform { translation: base_link.translation - origin, ..base_link };
-    Ok(Standing { q: solved.rows(6, robot.joint_names.len()).iter().copied().collect(), base_link: moved, com: com - origin })
+    Ok(Standing {
+        q: solved.rows(6, robot.joint_names.len()).iter().copied().collect(),
+        base_link: moved,
+        com: com - origin,
+    })
 }
 
 /// Puts the frames of tips where they touch the ground in a posture, upright.
@@ -132,9 +136,10 @@ impl<'a> Problem<'a> {
         });
         let mut feet: Vec<Foot> = feet.collect();
         // The root link's axes at zero have x forward only if the feet say so: headings are those of the soles.
-        let heading = feet.iter().find(|foot| foot.is_flat).map_or_else(Matrix3::identity, |foot| {
-            (poses[foot.body] * foot.in_body).rotation
-        });
+        let heading = feet
+            .iter()
+            .find(|foot| foot.is_flat)
+            .map_or_else(Matrix3::identity, |foot| (poses[foot.body] * foot.in_body).rotation);
         let turn = heading.fixed_view::<2, 2>(0, 0).transpose();
         let middle = feet.iter().map(|foot| foot.place).sum::<Vector2<f64>>() / feet.len().max(1) as f64;
         for foot in &mut feet {
@@ -166,13 +171,15 @@ impl<'a> Problem<'a> {
                 false => vec![foot.place],
             }
         };
-        let support = hull(&problem.feet.iter().zip(found).flat_map(|(f, s)| corners(f, s)).collect::<Vec<_>>());
+        let support =
+            hull(&problem.feet.iter().zip(found).flat_map(|(f, s)| corners(f, s)).collect::<Vec<_>>());
         problem.support = if support.len() >= 3 { centroid(&support) } else { Vector2::zeros() };
         Ok(problem)
     }
 
     fn bounds(&self) -> (DVector<f64>, DVector<f64>) {
-        let ranges: Vec<(f64, f64)> = self.robot.limits.iter().map(|limits| kept(limits, LEG_MARGIN)).collect();
+        let ranges: Vec<(f64, f64)> =
+            self.robot.limits.iter().map(|limits| kept(limits, LEG_MARGIN)).collect();
         let bound = |base: f64, of: fn(&(f64, f64)) -> f64| {
             DVector::from_iterator(
                 6 + ranges.len(),
@@ -188,7 +195,8 @@ impl<'a> Problem<'a> {
         let translation = Vector3::new(x[0], x[1], x[2]);
         let base_link = RigidTransform { rotation: exp_rotation(&turn) * self.upright, translation };
         let tree = &self.robot.tree;
-        let configuration = Configuration::floating(base_pose_from_link(tree, &base_link), &x.as_slice()[6..]);
+        let configuration =
+            Configuration::floating(base_pose_from_link(tree, &base_link), &x.as_slice()[6..]);
         // Lengths fit: the vector is made for this tree.
         let _ = self.kinematics.update_positions(tree, &configuration);
         (base_link, self.kinematics.mass_centre_of_tree_w(tree))
@@ -227,11 +235,17 @@ impl<'a> Problem<'a> {
         };
         let off = self.feet.iter().map(height).fold(0.0, f64::max);
         if off > GOOD_M {
-            return Err(format!("no posture brings all feet to the ground: {:.1} mm or mrad are left", 1e3 * off));
+            return Err(format!(
+                "no posture brings all feet to the ground: {:.1} mm or mrad are left",
+                1e3 * off
+            ));
         }
         let off = (com.xy() - self.support).norm();
         if off > GOOD_COM_M {
-            return Err(format!("no posture brings the mass centre over the feet: {:.0} mm are left", 1e3 * off));
+            return Err(format!(
+                "no posture brings the mass centre over the feet: {:.0} mm are left",
+                1e3 * off
+            ));
         }
         Ok(())
     }
@@ -277,7 +291,8 @@ fn rather(
             let joint = &robot.tree.bodies()[body].joint;
             let axis_w = poses[body].rotation * joint.axis;
             let along = axis_w.dot(&heading.column(1).into_owned());
-            (joint.kind == JointKind::Revolute && along.abs() > LATERAL).then_some((body - first, along.signum()))
+            (joint.kind == JointKind::Revolute && along.abs() > LATERAL)
+                .then_some((body - first, along.signum()))
         };
         let pitch: Vec<(usize, f64)> = leg.iter().filter_map(|body| back(*body)).collect();
         let [(hip, hip_sign), (bend, bend_sign), ..] = pitch[..] else { continue };

@@ -27,6 +27,8 @@ pub struct Table {
     pub hands: Vec<(String, String, Vector3<f64>)>,
     /// Posture and the joints it is over.
     pub posture: Option<(Standing, Vec<String>)>,
+    /// Whether it is bolted down: its posture has no base.
+    pub is_bolted: bool,
     /// What should be known.
     pub notes: Vec<String>,
 }
@@ -69,24 +71,32 @@ impl Table {
             );
         }
         if let Some((standing, joints)) = &self.posture {
-            text.push_str(&posture_text("stand", standing, joints));
+            text.push_str(&posture_text("stand", standing, joints, !self.is_bolted));
         }
         text
     }
 }
 
 /// A posture as an entry of a companion table.
-pub fn posture_text(name: &str, standing: &Standing, joints: &[String]) -> String {
+pub fn posture_text(name: &str, standing: &Standing, joints: &[String], floats: bool) -> String {
     let rotation = Rotation3::from_matrix_unchecked(standing.base_link.rotation);
     let (roll, pitch, yaw) = rotation.euler_angles();
-    let mut text = format!(
-        "\n# Where it stands at rest: the root link in a world whose origin is the middle of the support, x forward, z up. The mass centre\n\
+    let mut text = if floats {
+        format!(
+            "\n# Where it stands at rest: the root link in a world whose origin is the middle of the support, x forward, z up. The mass centre\n\
          # is over it. Solved by inverse kinematics; joints that are not named are at 0.\n\
          [[posture]]\nname = {}\nbase_position_m = {}\nbase_rpy_rad = {}\n[posture.joints]\n",
-        quoted(name),
-        exact(standing.base_link.translation.iter()),
-        exact([roll, pitch, yaw].iter())
-    );
+            quoted(name),
+            exact(standing.base_link.translation.iter()),
+            exact([roll, pitch, yaw].iter())
+        )
+    } else {
+        format!(
+            "\n# How it rests: where its hand moves well in all directions. Joints that are not named are at 0.\n\
+             [[posture]]\nname = {}\n[posture.joints]\n",
+            quoted(name)
+        )
+    };
     for (name, value) in joints.iter().zip(&standing.q).filter(|(_, value)| **value != 0.0) {
         let _ = writeln!(text, "{} = {value:?}", quoted(name));
     }

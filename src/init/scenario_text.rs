@@ -4,9 +4,8 @@ use std::fmt::Write as _;
 
 use delmpc_mechanics::kinematics::{Configuration, Kinematics};
 use delmpc_robots::RobotModel;
-use nalgebra::{Vector2, Vector3};
+use nalgebra::Vector2;
 
-use crate::init::feet::hull;
 use crate::init::files::{in_comment, list, quoted};
 use crate::init::posture::Standing;
 
@@ -17,6 +16,8 @@ pub enum Support<'a> {
     Sole(&'a str),
     /// All its feet.
     AllFeet,
+    /// Nothing: it is bolted down.
+    Bolted,
 }
 
 /// What the scenario is scaled by.
@@ -28,58 +29,52 @@ pub struct Size {
     pub height: f64,
     /// Distances of the mass centre from the front and from the outer edge of the sole, m.
     pub to_edge: [f64; 2],
+    /// Of an arm that is bolted down: its hand in the frame of its root link, m.
+    pub hand: [f64; 3],
 }
 
 /// The robot whose weights are the defaults: Atlas.
 const REFERENCE_HEIGHT_M: f64 = 1.0;
 const REFERENCE_WEIGHT_N: f64 = 1717.0;
 
+/// Weight of the hand of an arm of 1 m, 1/m².
+const HAND_OF_ARM: f64 = 30_000.0;
+/// Whole plant steps.
+const RATES_HZ: [f64; 4] = [100.0, 125.0, 200.0, 250.0];
+/// Farthest a foot may slip, as a part of the height of the mass centre.
+const SLIP_PART: f64 = 0.05;
+
 impl Size {
     /// Of a robot that stands in the posture `stand` of its table.
     pub fn of(robot: &RobotModel, support: Support<'_>, standing: &Standing) -> Self {
-        let mass = robot.tree.total_mass();
-        let polygon = match support {
-            Support::Sole(sole) => robot.sole(sole).map(|sole| sole.polygon.clone()).unwrap_or_default(),
-            Support::AllFeet => support_polygon(robot),
+        let all: Vec<String> = robot.soles.iter().map(|sole| sole.name.clone()).collect();
+        let soles = match support {
+            Support::Sole(sole) => vec![sole.to_owned()],
+            Support::AllFeet => all,
+            Support::Bolted => Vec::new(),
         };
-        // Distance of the mass centre, which is over the origin, from the edge in a direction.
-        let reach = |direction: Vector2<f64>| {
-            let edges = polygon.iter().zip(polygon.iter().cycle().skip(1));
-            let crossings = edges.filter_map(|(a, b)| {
-                let (from, along) = (a - standing.com.xy(), b - a);
-                let (cross, part) = (direction.perp(&along), from.perp(&direction));
-                let at = part / cross;
-                (cross.abs() > 1e-12 && (0.0..=1.0).contains(&at)).then(|| from.perp(&along) / cross)
-            });
-            crossings.fold(0.0, f64::max)
-        };
+        let ground = crate::support::Support::new(robot, "stand", &soles);
+        let reach = |direction| ground.as_ref().and_then(|ground| ground.reach(direction)).unwrap_or(0.0);
         let to_edge = [reach(Vector2::x()), reach(Vector2::y()).min(reach(-Vector2::y()))];
-        Self { mass, height: standing.com.z, to_edge }
+        Self { mass: robot.tree.total_mass(), height: standing.com.z, to_edge, hand: [0.0; 3] }
+    }
+
+    /// Of a robot that is bolted down: its length counts, how far its hand is from the mount.
+    pub fn of_arm(robot: &RobotModel, hand: &str, standing: &Standing) -> Self {
+        let mut kinematics = Kinematics::new(&robot.tree);
+        let posed = kinematics.update_positions(&robot.tree, &Configuration::fixed(&standing.q)).is_ok();
+        let frame = robot.frame(hand).filter(|_| posed);
+        let place =
+            frame.and_then(|frame| Some((kinematics.link_poses_w()[frame.body?] * frame.pose).translation));
+        let place = place.unwrap_or_default();
+        let mass = robot.tree.total_mass();
+        Self { mass, height: place.norm().max(0.05), to_edge: [0.0; 2], hand: place.into() }
     }
 
     /// What an inverted pendulum on this support survives at most when pushed forward, N s.
     pub fn capture_limit_forward(&self) -> f64 {
         self.mass * (9.81 / self.height).sqrt() * self.to_edge[0]
     }
-}
-
-/// Hull of all feet on the ground in the posture `stand`, counter-clockwise.
-fn support_polygon(robot: &RobotModel) -> Vec<Vector2<f64>> {
-    let posture = robot.posture("stand");
-    let Some((posture, base)) = posture.and_then(|posture| Some((posture, robot.base_pose_w(posture)?)))
-    else {
-        return Vec::new();
-    };
-    let mut kinematics = Kinematics::new(&robot.tree);
-    if kinematics.update_positions(&robot.tree, &Configuration::floating(base, &posture.q)).is_err() {
-        return Vec::new();
-    }
-    let corner = |index: &usize| -> Option<Vector3<f64>> {
-        let contact = &robot.contacts[*index];
-        Some(kinematics.link_poses_w()[contact.body?].transform_point(&contact.position))
-    };
-    let corners = robot.soles.iter().flat_map(|sole| sole.contacts.iter().filter_map(corner));
-    hull(&corners.map(|corner| corner.xy()).collect::<Vec<_>>())
 }
 
 /// The scenario; the ball with the hand that fetches it.
@@ -90,7 +85,11 @@ pub fn scenario_text(
     size: &Size,
     ball: Option<(&str, [f64; 3])>,
 ) -> String {
-    let Support::Sole(sole) = support else { return on_feet(robot, stem, size) };
+    let sole = match support {
+        Support::Sole(sole) => sole,
+        Support::AllFeet => return on_feet(robot, stem, size),
+        Support::Bolted => return bolted(stem, robot, size, ball),
+    };
     let fetches = if ball.is_some() { ", fetches a ball" } else { "" };
     let mut text = format!(
         "# {} stands on its sole `{sole}`{fetches}, takes a push, and stays up. Written by `delmpc init`; change it as you like.\n\
@@ -108,20 +107,59 @@ pub fn scenario_text(
     keys(&mut text, "robot", &keys_of_robot);
     scaled(&mut text, size);
     if let Some((hand, at)) = ball {
-        let (hand, at) = (quoted(hand), list(at.iter()));
-        text.push_str("\n# A ball 10 cm from where the hand rests.");
-        let keys_of_reach = [
-            ("hand", hand.as_str(), "frame of the companion table, or link"),
-            ("ball_m", at.as_str(), "in the frame of the sole: x forward, y left, z up"),
-            ("start_s", "1.0", "when the motion begins"),
-            ("deadline_s", "1.5", "how long it may take"),
-            ("hold_s", "0.8", "how long the hand stays"),
-            ("return_s", "1.2", "how long the way back takes"),
-        ];
-        keys(&mut text, "reach", &keys_of_reach);
+        reach(&mut text, hand, &at, "sole");
     }
     push(&mut text, robot, size, "sole", 5.0);
     text
+}
+
+/// The scenario of an arm that is bolted down.
+fn bolted(stem: &str, robot: &RobotModel, size: &Size, ball: Option<(&str, [f64; 3])>) -> String {
+    let mut text = format!(
+        "# {} is bolted down and reaches for a ball. Written by `delmpc init`; change it as you like.\n\
+         # A key that is not here has a default: `delmpc run` leaves all of them in scenario.toml of the run's folder.\n",
+        in_comment(&robot.name)
+    );
+    let urdf = quoted(&format!("{stem}.urdf"));
+    keys(&mut text, "", &[("seed", "1", "of everything random"), ("duration_s", "5.0", "of the run, s")]);
+    let keys_of_robot = [
+        ("urdf", urdf.as_str(), "its companion table lies beside it"),
+        ("base", "\"fixed\"", "its root link is bolted to the world"),
+        ("posture", "\"stand\"", "posture of that table that it begins and rests in"),
+    ];
+    keys(&mut text, "robot", &keys_of_robot);
+    let scale = (REFERENCE_HEIGHT_M / size.height).powi(2);
+    let (hand, posture) = (three_digits(HAND_OF_ARM * scale), three_digits(5.0 * scale));
+    let _ = write!(
+        text,
+        "\n# Weights: one over the square of what counts 1. Lengths go with its reach, {:.2} m to the hand.",
+        size.height
+    );
+    let keys_of_weights = [
+        ("posture_per_rad2", posture.as_str(), "every joint away from the posture"),
+        ("torque_per_limit2", "10.0", "every joint's torque beside what gravity asks, over its limit"),
+        ("hand_per_m2", hand.as_str(), "hand away from its way to the ball"),
+    ];
+    keys(&mut text, "controller.weights", &keys_of_weights);
+    if let Some((hand, at)) = ball {
+        reach(&mut text, hand, &at, "root link");
+    }
+    text
+}
+
+fn reach(text: &mut String, hand: &str, at: &[f64; 3], frame: &str) {
+    let (hand, at) = (quoted(hand), list(at.iter()));
+    let where_m = format!("in the frame of the {frame}: x forward, y left, z up");
+    text.push_str("\n# A ball 10 cm from where the hand rests.");
+    let keys_of_reach = [
+        ("hand", hand.as_str(), "frame of the companion table, or link"),
+        ("ball_m", at.as_str(), where_m.as_str()),
+        ("start_s", "1.0", "when the motion begins"),
+        ("deadline_s", "1.5", "how long it may take"),
+        ("hold_s", "0.8", "how long the hand stays"),
+        ("return_s", "1.2", "how long the way back takes"),
+    ];
+    keys(text, "reach", &keys_of_reach);
 }
 
 /// The scenario of a robot on all its feet.
@@ -140,13 +178,38 @@ fn on_feet(robot: &RobotModel, stem: &str, size: &Size) -> String {
     ];
     keys(&mut text, "robot", &keys_of_robot);
     sensors(&mut text, size);
+    let flat = robot.soles.iter().all(|sole| sole.contacts.len() > 1);
+    // Small robots fall faster; feet that are points leave less to balance with between two cycles, and less to correct.
+    let wanted_hz = if flat { 100.0 * (REFERENCE_HEIGHT_M / size.height).powf(1.5) } else { 0.0 };
+    let rate_hz = RATES_HZ.into_iter().find(|rate| *rate >= wanted_hz).unwrap_or(RATES_HZ[3]);
+    let rate = format!("{rate_hz:?}");
     let keys_of_controller = [
-        ("mpc_rate_hz", "100.0", "control cycles per second"),
+        ("mpc_rate_hz", rate.as_str(), "control cycles per second"),
         ("horizon_s", "0.8", "how far it looks ahead, s"),
         ("stages", "20", "that the horizon is cut into"),
     ];
     keys(&mut text, "controller", &keys_of_controller);
     push(&mut text, robot, size, "feet", 1.0);
+    let slip = three_digits(SLIP_PART * size.height);
+    keys(&mut text, "success", &[("max_stance_slip_m", slip.as_str(), "farthest a foot may slip, m")]);
+    if matches!(robot.soles.len(), 2 | 4) {
+        text.push_str(&gait(flat, robot.soles.len(), size));
+    }
+    text
+}
+
+/// How it would walk or trot, in comments.
+fn gait(flat: bool, feet: usize, size: &Size) -> String {
+    // A fraction of the speed √(g h) of a pendulum of its size.
+    let (kind, part) = if feet == 2 { ("walk", 0.07) } else { ("trot", 0.18) };
+    let speed = format!("{:.2}", part * (9.81 * size.height).sqrt());
+    let mut text = format!(
+        "\n# To have it {kind}: take the `# ` away from the following lines, and give the run more time, duration_s = 8.0.\n\
+         # [gait]\n# kind = \"{kind}\"\n# speed_m_s = {speed}   # ahead\n# start_s = 2.5      # when it begins\n# stop_s = 7.0       # when it stands again\n"
+    );
+    if flat {
+        text.push_str("# To be put into [success]: max_stance_tilt_rad = 0.2, min_cop_margin_m = -0.02\n");
+    }
     text
 }
 
@@ -232,4 +295,3 @@ fn three_digits(value: f64) -> String {
     let unit = 10_f64.powf(2.0 - value.abs().max(1e-12).log10().floor());
     format!("{:?}", (value * unit).round() / unit)
 }
-
