@@ -125,6 +125,7 @@ const KEYS_EXAMPLES: &str = "\
 Examples:
   delmpc keys                                   a page in Markdown
   delmpc keys controller.legged
+  delmpc keys --companion
   delmpc keys --schema > scenario.schema.json   for an editor that knows JSON schemas of TOML files";
 
 const CHECK_EXAMPLES: &str = "\
@@ -202,7 +203,7 @@ pub enum Command {
     /// there is an error.
     #[command(after_long_help = CHECK_EXAMPLES)]
     Check(CheckArguments),
-    /// List every key of a scenario: what it takes, its default, what it means; or a JSON schema for editors
+    /// List every key of scenarios and companion tables: what it takes, its default, what it means; or a JSON schema for editors
     #[command(after_long_help = KEYS_EXAMPLES)]
     Keys(KeysArguments),
     /// Find the largest push survived in every direction: table, JSON, polar plot

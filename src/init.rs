@@ -249,7 +249,9 @@ fn lock_joints(robot: &RobotModel, table: &mut Table) {
         } else {
             continue;
         };
-        let at = 0.0_f64.clamp(limits.lower, limits.upper.max(limits.lower));
+        // A follower is where it is when the other joint is at 0.
+        let (_, _, offset) = robot.coordinate_map.row(joint);
+        let at = offset.clamp(limits.lower, limits.upper.max(limits.lower));
         table.locked.push((name.clone(), at, why));
     }
 }

@@ -1,8 +1,10 @@
-//! `delmpc keys`: every key of a scenario, from the types that read it: a page, or a JSON schema with which an editor completes and checks.
+//! `delmpc keys`: every key of scenarios and companion tables, from the types that read them: a page, or a JSON schema with which an editor
+//! completes and checks.
 
 use std::fmt::Write as _;
 
 use delmpc_scenario::Scenario;
+use schemars::Schema;
 use serde_json::Value;
 
 use crate::output::print;
@@ -13,6 +15,9 @@ use crate::verdict::{Ended, Failure};
 pub struct KeysArguments {
     /// Only keys that begin like this, for example controller.legged
     pub prefix: Option<String>,
+    /// Those of a robot's companion table instead of a scenario's
+    #[arg(long)]
+    pub companion: bool,
     /// The JSON schema instead of the page
     #[arg(long, conflicts_with = "prefix")]
     pub schema: bool,
@@ -36,39 +41,66 @@ pub struct Key {
 /// # Errors
 /// [`Failure::Fault`] when it cannot be written.
 pub fn keys(arguments: &KeysArguments) -> Result<Ended, Failure> {
+    let of = if arguments.companion { Format::Companion } else { Format::Scenario };
     if arguments.schema {
-        print(&schema_text())?;
+        print(&of.schema_text())?;
         return Ok(Ended::Well);
     }
     let prefix = arguments.prefix.as_deref().unwrap_or_default();
-    let found: Vec<Key> = scenario_keys().into_iter().filter(|key| key.name.starts_with(prefix)).collect();
+    let found: Vec<Key> = of.keys().into_iter().filter(|key| key.name.starts_with(prefix)).collect();
     if found.is_empty() {
         return Err(Failure::Input(format!("no key begins with `{prefix}`: delmpc keys lists all of them")));
     }
-    print(&page(&found))?;
+    print(&of.page(&found))?;
     Ok(Ended::Well)
 }
 
-/// The JSON schema of scenarios.
-pub fn schema_text() -> String {
-    let text = serde_json::to_string_pretty(schemars::schema_for!(Scenario).as_value()).unwrap_or_default();
-    text + "\n"
+/// A file format.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// Scenario files.
+    Scenario,
+    /// Companion tables of robots.
+    Companion,
 }
 
-/// All keys of a scenario, section by section.
-pub fn scenario_keys() -> Vec<Key> {
-    let schema = schemars::schema_for!(Scenario);
-    let mut keys = Vec::new();
-    collect(schema.as_value(), schema.as_value(), "", &mut keys);
-    keys
+impl Format {
+    fn schema(self) -> Schema {
+        match self {
+            Self::Scenario => schemars::schema_for!(Scenario),
+            Self::Companion => delmpc_robots::companion_schema(),
+        }
+    }
+
+    /// Its JSON schema.
+    pub fn schema_text(self) -> String {
+        serde_json::to_string_pretty(self.schema().as_value()).unwrap_or_default() + "\n"
+    }
+
+    /// All its keys, section by section.
+    pub fn keys(self) -> Vec<Key> {
+        let schema = self.schema();
+        let mut keys = Vec::new();
+        collect(schema.as_value(), schema.as_value(), "", &mut keys);
+        keys
+    }
+
+    /// The page: a table for every section.
+    pub fn page(self, keys: &[Key]) -> String {
+        let (title, command) = match self {
+            Self::Scenario => ("a scenario", "delmpc keys"),
+            Self::Companion => ("a companion table", "delmpc keys --companion"),
+        };
+        let text = format!(
+            "# Keys of {title}\n\nWritten by `{command}` from the types that read them. `name[].key` is a key of a list of tables, `[[name]]`, \
+             or of one table, `[name]`.\n"
+        );
+        tables(text, keys)
+    }
 }
 
-/// The page: a table for every section.
-pub fn page(keys: &[Key]) -> String {
-    let mut text = String::from(
-        "# Keys of a scenario\n\nWritten by `delmpc keys` from the types that read them. `name[].key` is a key of a list of tables, `[[name]]`, \
-         or of one table, `[name]`.\n",
-    );
+/// A table for every section.
+fn tables(mut text: String, keys: &[Key]) -> String {
     let mut section = None;
     for key in keys {
         let of = key.name.rsplit_once('.').map_or("", |(section, _)| section);
@@ -114,7 +146,10 @@ fn collect(root: &Value, schema: &Value, prefix: &str, keys: &mut Vec<Key>) {
 
 /// What a reference stands for.
 fn resolved<'a>(root: &'a Value, schema: &'a Value) -> &'a Value {
-    let target = schema.get("$ref").and_then(Value::as_str).and_then(|path| root.pointer(path.trim_start_matches('#')));
+    let target = schema
+        .get("$ref")
+        .and_then(Value::as_str)
+        .and_then(|path| root.pointer(path.trim_start_matches('#')));
     target.unwrap_or(schema)
 }
 
@@ -217,8 +252,10 @@ mod tests {
     fn the_page_has_every_key_that_is_read_and_no_other() {
         let mut read = BTreeSet::new();
         known("", &mut read);
-        let read: BTreeSet<String> = read.into_iter().map(|name| name.trim_end_matches(".*").to_owned()).collect();
-        let told: BTreeSet<String> = scenario_keys().into_iter().map(|key| key.name.replace("[]", "")).collect();
+        let read: BTreeSet<String> =
+            read.into_iter().map(|name| name.trim_end_matches(".*").to_owned()).collect();
+        let told: BTreeSet<String> =
+            Format::Scenario.keys().into_iter().map(|key| key.name.replace("[]", "")).collect();
         assert!(read.len() > 150, "{}", read.len());
         let missing: Vec<&String> = read.difference(&told).collect();
         let more: Vec<&String> = told.difference(&read).collect();
@@ -226,8 +263,46 @@ mod tests {
     }
 
     #[test]
+    fn the_keys_of_a_companion_table_are_those_it_is_read_with() {
+        let told: BTreeSet<String> = Format::Companion.keys().into_iter().map(|key| key.name).collect();
+        // A table with a key that nobody knows is refused with the names of those that are known.
+        for (table, start) in [
+            ("", ""),
+            ("contact[].", "[[contact]]"),
+            ("frame[].", "[[frame]]"),
+            ("sole[].", "[[sole]]"),
+            ("spring[].", "[[spring]]"),
+            ("posture[].", "[[posture]]"),
+        ] {
+            let text = if table.is_empty() {
+                "zzz = 1\nformat = 1\n".to_owned()
+            } else {
+                format!("format = 1\n{start}\nzzz = 1\n")
+            };
+            let error = delmpc_robots::load_str(
+                "it.urdf",
+                "<robot name='a'/>",
+                Some(&text),
+                &delmpc_robots::LoadOptions::default(),
+            );
+            let said = error.unwrap_err().to_string();
+            let known: Vec<&str> = said.split('`').skip(3).step_by(2).collect();
+            assert!(known.len() >= 3, "{said}");
+            for key in known {
+                let is_table =
+                    start.is_empty() && told.iter().any(|told| told.starts_with(&format!("{key}[].")));
+                let is_alias = ["stiffness_n_per_m", "rest_m"].contains(&key);
+                assert!(
+                    is_table || is_alias || told.contains(&format!("{table}{key}")),
+                    "{table}{key} is not told"
+                );
+            }
+        }
+    }
+
+    #[test]
     fn every_key_says_what_it_takes_and_means() {
-        for key in scenario_keys() {
+        for key in [Format::Scenario, Format::Companion].into_iter().flat_map(Format::keys) {
             assert!(!key.takes.is_empty() && !key.meaning.is_empty(), "{key:?}");
         }
     }
@@ -235,12 +310,15 @@ mod tests {
     #[test]
     fn page_and_schema_that_are_shipped_are_those_of_the_types() {
         let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs");
+        let page = |of: Format| of.page(&of.keys());
         for (file, text, command) in [
-            ("keys.md", page(&scenario_keys()), "delmpc keys > configs/keys.md"),
-            ("scenario.schema.json", schema_text(), "delmpc keys --schema > configs/scenario.schema.json"),
+            ("scenario_keys.md", page(Format::Scenario), "delmpc keys"),
+            ("scenario.schema.json", Format::Scenario.schema_text(), "delmpc keys --schema"),
+            ("companion_keys.md", page(Format::Companion), "delmpc keys --companion"),
+            ("companion.schema.json", Format::Companion.schema_text(), "delmpc keys --companion --schema"),
         ] {
             let shipped = std::fs::read_to_string(configs.join(file)).unwrap_or_default();
-            assert!(shipped == text, "configs/{file} is not up to date: {command}");
+            assert!(shipped == text, "configs/{file} is not up to date: {command} > configs/{file}");
         }
     }
 }

@@ -25,7 +25,7 @@ const POINT_LIFT_PART: f64 = 0.2;
 const DEPTH_PART: f64 = 0.004;
 /// Periods of gaits on two and on four feet, in units of the time `√(height / g)` in which an inverted pendulum of the robot's size falls.
 const PERIOD_ON_TWO: f64 = 4.2;
-const PERIOD_ON_FOUR: f64 = 5.0;
+const PERIOD_ON_FOUR: f64 = 4.4;
 /// m/s².
 const GRAVITY: f64 = 9.81;
 

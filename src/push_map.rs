@@ -439,20 +439,6 @@ mod tests {
 
     use super::*;
 
-    #[test]
-    fn the_distance_to_the_edge_is_along_the_direction() {
-        let sole: Vec<Vector2<f64>> = [(0.1, -0.05), (0.1, 0.05), (-0.1, 0.05), (-0.1, -0.05)]
-            .map(|(x, y)| Vector2::new(x, y))
-            .to_vec();
-        let from = Vector2::new(0.02, 0.01);
-        let distance = |x: f64, y: f64| edge_distance(&sole, from, Vector2::new(x, y)).unwrap();
-        assert!((distance(1.0, 0.0) - 0.08).abs() < 1e-12);
-        assert!((distance(0.0, -1.0) - 0.06).abs() < 1e-12);
-        assert!((distance(-1.0, 0.0) - 0.12).abs() < 1e-12);
-        let diagonal = distance(0.5_f64.sqrt(), 0.5_f64.sqrt());
-        assert!((diagonal - 0.04 * 2.0_f64.sqrt()).abs() < 1e-12);
-    }
-
     fn arguments(seeds: u64) -> PushMapArguments {
         use clap::Parser;
         #[derive(Parser)]

@@ -2,15 +2,15 @@
 
 use delmpc_controller_core::config::{ConstraintConfig, ControllerConfig};
 use delmpc_controller_core::cycle::Clock as CycleClock;
+use delmpc_controller_core::errors::ControlError;
 use delmpc_controller_core::legged::LeggedController;
 use delmpc_controller_core::prelude as core;
 use delmpc_controller_core::prelude::{BodyPoint, ControllerModel, JointLimits, Reach, Sensing, TaskWeights};
 use delmpc_controller_process::clock::monotonic_ns;
 use delmpc_controller_process::controller_loop::Controller;
-use delmpc_controller_core::errors::ControlError;
 use delmpc_estimation::prelude::{EstimatorConfig, EstimatorModel, FootModel};
-use delmpc_mechanics::reroot::Rerooted;
 use delmpc_lq::errors::LqError;
+use delmpc_mechanics::reroot::Rerooted;
 use delmpc_messages::{Command, PlantState};
 use delmpc_robots::RobotModel;
 use delmpc_scenario::{Clock, ControllerKind, Scenario};
@@ -146,9 +146,11 @@ fn with_joint(robot: &RobotModel, joints: &[usize], error: &ControlError) -> Str
     let index = match error {
         // States are positions, then velocities.
         ControlError::Lq(LqError::NoStabilisingSolution { state, .. }) => Some(state % joints.len().max(1)),
-        ControlError::Value { quantity: "effort limit" | "velocity limit" | "position limit" | "posture", index, .. } => {
-            Some(*index)
-        }
+        ControlError::Value {
+            quantity: "effort limit" | "velocity limit" | "position limit" | "posture",
+            index,
+            ..
+        } => Some(*index),
         _ => None,
     };
     let joint = index.and_then(|index| joints.get(index)).copied();

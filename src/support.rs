@@ -65,6 +65,20 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_distance_to_the_edge_is_along_the_direction() {
+        let sole: Vec<Vector2<f64>> = [(0.1, -0.05), (0.1, 0.05), (-0.1, 0.05), (-0.1, -0.05)]
+            .map(|(x, y)| Vector2::new(x, y))
+            .to_vec();
+        let support = Support { polygon: sole, com: Vector3::new(0.02, 0.01, 1.0) };
+        let distance = |x: f64, y: f64| support.reach(Vector2::new(x, y)).unwrap();
+        assert!((distance(1.0, 0.0) - 0.08).abs() < 1e-12);
+        assert!((distance(0.0, -1.0) - 0.06).abs() < 1e-12);
+        assert!((distance(-1.0, 0.0) - 0.12).abs() < 1e-12);
+        let diagonal = distance(0.5_f64.sqrt(), 0.5_f64.sqrt());
+        assert!((diagonal - 0.04 * 2.0_f64.sqrt()).abs() < 1e-12);
+    }
+
+    #[test]
     fn the_support_of_several_feet_is_their_hull() {
         let robots = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/robots");
         let dog = delmpc_robots::load(robots.join("littledog.urdf")).unwrap();

@@ -136,7 +136,11 @@ fn a_biped_stands_on_both_feet() {
     assert_eq!(status, Some(0), "{said}{errors}");
     let summary: serde_json::Value = serde_json::from_str(&said).unwrap();
     assert!(summary["push_impulse_ns"].as_f64().unwrap() > 3.0, "{said}");
-    assert_eq!((&summary["recovered"], &summary["contact_sets_visited"]), (&true.into(), &1.into()), "{said}");
+    assert_eq!(
+        (&summary["recovered"], &summary["contact_sets_visited"]),
+        (&true.into(), &1.into()),
+        "{said}"
+    );
 }
 
 #[test]

@@ -45,12 +45,14 @@ fn dog(foot: &str, range: [f64; 2], effort: f64) -> String {
     text + "</robot>\n"
 }
 
-const TIP: &str = "<collision><origin xyz='0 0 -0.2'/><geometry><sphere radius='0.02'/></geometry></collision>";
+const TIP: &str =
+    "<collision><origin xyz='0 0 -0.2'/><geometry><sphere radius='0.02'/></geometry></collision>";
 
 /// Six joints on a heavy foot.
 fn arm() -> String {
     let mut text = String::from("<robot name='arm'>\n");
-    let foot = "<collision><origin xyz='0 0 0.05'/><geometry><box size='0.2 0.2 0.1'/></geometry></collision>";
+    let foot =
+        "<collision><origin xyz='0 0 0.05'/><geometry><box size='0.2 0.2 0.1'/></geometry></collision>";
     link(&mut text, "foot", 4.0, -0.05, 0.2, foot);
     let mut parent = "foot".to_owned();
     for (name, z, axis, mass, effort) in [
@@ -140,7 +142,14 @@ fn an_arm_is_bolted_down_and_reaches() {
     assert!(reached["hand_error_hold_max_m"].as_f64().unwrap() < 0.005, "{reached}");
     // Heavier than the controller knows by a tenth, and pushed.
     let push = [
-        "--set", "plant.mass_scale=1.1", "--set", "push.link=elbow", "--set", "push.impulse_ns=2", "--set", "push.start_s=0.3",
+        "--set",
+        "plant.mass_scale=1.1",
+        "--set",
+        "push.link=elbow",
+        "--set",
+        "push.impulse_ns=2",
+        "--set",
+        "push.start_s=0.3",
     ];
     run(&folder, &push);
     // The same without the key: it stands on nothing.

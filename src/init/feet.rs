@@ -103,12 +103,16 @@ pub fn find_feet(robot: &RobotModel) -> Result<Vec<FoundFoot>, NoFeet> {
     let heights = || clouds.iter().flat_map(|cloud| cloud.points_w.iter().map(|point| point.z));
     let lowest = heights().fold(f64::INFINITY, f64::min);
     let highest = poses.iter().map(|pose| pose.translation.z).chain(heights()).fold(lowest, f64::max);
-    // An arm stands on its root link.
-    let on_root =
-        cloud(robot, 0, &poses[0]).is_some_and(|root| root.points_w.iter().any(|point| point.z < lowest));
+    // An arm stands on its root link: nothing of it is lower, whatever shapes its other links lack.
+    let root_points = cloud(robot, 0, &poses[0]).map(|root| root.points_w).unwrap_or_default();
+    let root_lowest = root_points.iter().map(|point| point.z).fold(f64::INFINITY, f64::min);
+    let on_root = root_lowest < lowest && poses.iter().all(|pose| pose.translation.z >= root_lowest);
     let centre = |body: usize| poses[body].transform_point(&robot.tree.bodies()[body].inertia.com).z;
     let is_lowest = (0..poses.len()).all(|body| centre(body) >= centre(0));
-    if on_root || is_lowest {
+    // Or hangs on it: one limb that outweighs it.
+    let leaves = (first..poses.len()).filter(|body| !carries(*body)).count();
+    let is_limb = leaves == 1 && 2.0 * robot.tree.bodies()[0].inertia.mass < robot.tree.total_mass();
+    if on_root || is_lowest || is_limb {
         return Err(NoFeet::Fixed);
     }
     if clouds.is_empty() {
