@@ -142,15 +142,10 @@ fn an_arm_is_bolted_down_and_reaches() {
     assert!(reached["hand_error_hold_max_m"].as_f64().unwrap() < 0.005, "{reached}");
     // Heavier than the controller knows by a tenth, and pushed.
     let push = [
-        "--set",
-        "plant.mass_scale=1.1",
-        "--set",
-        "push.link=elbow",
-        "--set",
-        "push.impulse_ns=2",
-        "--set",
-        "push.start_s=0.3",
-    ];
+        ["--set", "plant.mass_scale=1.1", "--set", "push.link=elbow", "--set", "push.impulse_ns=2"],
+        ["--set", "push.start_s=5", "--set", "duration_s=8", "--set", "seed=2"],
+    ]
+    .concat();
     run(&folder, &push);
     // The same without the key: it stands on nothing.
     let (status, _, errors) = delmpc(&folder, &["check", "it/stand.toml", "--set", "robot.base=floating"]);
