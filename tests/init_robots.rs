@@ -89,7 +89,7 @@ fn delmpc(folder: &Path, arguments: &[&str]) -> (Option<i32>, String, String) {
 
 /// A run in lockstep that has to end well.
 fn run(folder: &Path, changes: &[&str]) -> serde_json::Value {
-    let run = ["run", "it/stand.toml", "--set", "clock=lockstep", "--no-report", "--json", "--out", "run"];
+    let run = ["run", "it/stand.toml", "--set", "clock=lockstep", "--json", "--out", "run"];
     let (status, said, errors) = delmpc(folder, &[&run[..], changes].concat());
     assert_eq!(status, Some(0), "{said}{errors}");
     serde_json::from_str(&said).unwrap()
