@@ -11,6 +11,7 @@ use delmpc_mechanics::kinematics::{Configuration, Kinematics};
 use delmpc_mechanics::mass_matrix::{MassMatrixWorkspace, mass_matrix_into};
 use delmpc_mechanics::prelude::{JointKind, KinematicTree, RigidTransform};
 use delmpc_robots::{LoadOptions, RobotModel, load_with};
+use nalgebra::DMatrix;
 
 use crate::output::{line, say};
 use crate::robot_controller::RobotController;
@@ -170,9 +171,12 @@ pub fn clamp_efforts(robot: &mut RobotModel) -> Vec<String> {
 
 /// A joint turns next to nothing below this part of the robot's mass times the square of its size.
 const NEXT_TO_NOTHING: f64 = 1e-9;
+/// Eigenvalues of a matrix with ones on its diagonal are no smaller than this by round-off.
+const ROUND_OFF: f64 = 1e-15;
 
-/// Joints that, with all joints at zero, turn next to no inertia, and how much, kg m²: point masses on their own axis. No motor's torque
-/// says anything of their motion.
+/// Joints that, with all joints at zero, turn next to no inertia when all others are free to give way, and how much, kg m²: point masses on
+/// their own axis, or one of several joints that together turn nothing. No motor's torque says anything of their motion. The least one is
+/// found first and taken for locked before the next.
 pub fn weightless_joints(robot: &RobotModel) -> Vec<(usize, f64)> {
     let tree = &robot.tree;
     let zeros = vec![0.0; tree.joint_count()];
@@ -192,10 +196,37 @@ pub fn weightless_joints(robot: &RobotModel) -> Vec<(usize, f64)> {
     let (torque, _) = largest_efforts(tree);
     let weight = tree.total_mass() * tree.gravity_w().norm().max(1.0);
     let size = torque / (PLACEHOLDER * weight);
+    let nothing = NEXT_TO_NOTHING * tree.total_mass() * size * size;
     let first = dof - tree.joint_count();
-    let inertia = |joint: usize| matrix[(first + joint) * (dof + 1)];
-    let light = |joint: &(usize, f64)| joint.1 < NEXT_TO_NOTHING * tree.total_mass() * size * size;
-    (0..tree.joint_count()).map(|joint| (joint, inertia(joint))).filter(light).collect()
+    let matrix = DMatrix::from_row_slice(dof, dof, &matrix);
+    let mut moving: Vec<usize> = (0..dof).collect();
+    let mut found = Vec::new();
+    while let Some((coordinate, inertia)) =
+        least_inertia(&matrix, &moving, first).filter(|(_, i)| *i < nothing)
+    {
+        found.push((coordinate - first, inertia));
+        moving.retain(|other| *other != coordinate);
+    }
+    found.sort_by_key(|(joint, _)| *joint);
+    found
+}
+
+/// Of the coordinates from `first` on, the one with the least `1 / (M⁻¹)_ii`, and that; `M` over the moving coordinates.
+fn least_inertia(matrix: &DMatrix<f64>, moving: &[usize], first: usize) -> Option<(usize, f64)> {
+    let own = |coordinate: usize| matrix[(coordinate, coordinate)].max(f64::MIN_POSITIVE);
+    // With ones on the diagonal: what is small then is small for its kind.
+    let scaled = DMatrix::from_fn(moving.len(), moving.len(), |row, column| {
+        matrix[(moving[row], moving[column])] / (own(moving[row]) * own(moving[column])).sqrt()
+    });
+    let modes = scaled.symmetric_eigen();
+    let inertia = |place: usize| {
+        let parts = modes.eigenvalues.iter().enumerate();
+        let inverse: f64 =
+            parts.map(|(mode, value)| modes.eigenvectors[(place, mode)].powi(2) / value.max(ROUND_OFF)).sum();
+        own(moving[place]) / inverse
+    };
+    let joints = (0..moving.len()).filter(|place| moving[*place] >= first);
+    joints.map(|place| (moving[place], inertia(place))).min_by(|a, b| a.1.total_cmp(&b.1))
 }
 
 /// Torque and force that no joint of the robot needs.
@@ -216,4 +247,40 @@ fn largest_efforts(tree: &KinematicTree) -> (f64, f64) {
     });
     let weight = tree.total_mass() * tree.gravity_w().norm();
     (PLACEHOLDER * weight * 2.0 * size.1.max(0.05), 10.0 * PLACEHOLDER * weight)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Two joints on one axis with next to nothing between them: each turns the lever, both against each other turn nothing.
+    #[test]
+    fn joints_that_together_turn_nothing_are_found() {
+        let link = |name: &str, mass: f64, size: f64| {
+            format!(
+                "<link name='{name}'><inertial><origin xyz='0 0.2 0'/><mass value='{mass}'/><inertia ixx='{size}' ixy='0' ixz='0' iyy='{size}' iyz='0' izz='{size}'/></inertial></link>"
+            )
+        };
+        let joint = |name: &str, parent: &str, child: &str| {
+            format!(
+                "<joint name='{name}' type='revolute'><parent link='{parent}'/><child link='{child}'/><axis xyz='1 0 0'/><limit lower='-1' upper='1' effort='5' velocity='5'/></joint>"
+            )
+        };
+        let robot = |between: f64| {
+            let text = [
+                "<robot name='a'>".to_owned(),
+                link("base", 5.0, 0.05),
+                joint("first", "base", "ring"),
+                link("ring", between, 0.01 * between),
+                joint("second", "ring", "lever"),
+                link("lever", 1.0, 0.01),
+                "</robot>".to_owned(),
+            ];
+            delmpc_robots::load_str("a.urdf", &text.concat(), None, &LoadOptions::default()).unwrap()
+        };
+        assert_eq!(weightless_joints(&robot(0.1)), []);
+        let found = weightless_joints(&robot(1e-12));
+        assert_eq!(found.len(), 1, "the other one turns the lever when this one is locked: {found:?}");
+        assert!(found[0].1 < 1e-10, "{found:?}");
+    }
 }

@@ -7,6 +7,7 @@ use clap::{Args, Parser, Subcommand};
 use crate::check::CheckArguments;
 use crate::completions::CompletionsArguments;
 use crate::init::InitArguments;
+use crate::keys::KeysArguments;
 use crate::model::ModelArguments;
 use crate::plan::PlanArguments;
 use crate::push_map::PushMapArguments;
@@ -115,7 +116,17 @@ const INIT_EXAMPLES: &str = "\
 Examples:
   delmpc init talos.urdf                        folder talos with talos.urdf, talos.toml, stand.toml
   delmpc init talos.urdf --stand left --out try
+  delmpc init talos.urdf --stand both           on both feet
+  delmpc init a1.urdf && delmpc run a1/stand.toml --set gait.kind=trot --set gait.speed_m_s=0.3
+  delmpc init panda.urdf                        no feet: bolted down, reaches for a ball
   delmpc check talos/stand.toml && delmpc run talos/stand.toml";
+
+const KEYS_EXAMPLES: &str = "\
+Examples:
+  delmpc keys                                   a page in Markdown
+  delmpc keys controller.legged
+  delmpc keys --companion
+  delmpc keys --schema > scenario.schema.json   for an editor that knows JSON schemas of TOML files";
 
 const CHECK_EXAMPLES: &str = "\
 Examples:
@@ -181,8 +192,9 @@ pub enum Command {
     Model(ModelArguments),
     /// Make a companion table and a scenario for a robot that has none
     ///
-    /// Soles are found from its shapes and mesh files, a posture on one sole is solved by inverse kinematics, weights, noise and push are
-    /// those of its size. Joints that cannot be driven are locked. The files say what every key means; change them as you like.
+    /// Feet are found from its shapes and mesh files, a posture on one sole, two or four feet is solved by inverse kinematics, weights, noise
+    /// and push are those of its size. A robot without feet is bolted down and reaches. Joints that cannot be driven are locked. The files
+    /// say what every key means; change them as you like.
     #[command(after_long_help = INIT_EXAMPLES)]
     Init(InitArguments),
     /// Check scenarios, robots and companion tables: everything that `run` would refuse, all at once
@@ -191,6 +203,9 @@ pub enum Command {
     /// there is an error.
     #[command(after_long_help = CHECK_EXAMPLES)]
     Check(CheckArguments),
+    /// List every key of scenarios and companion tables: what it takes, its default, what it means; or a JSON schema for editors
+    #[command(after_long_help = KEYS_EXAMPLES)]
+    Keys(KeysArguments),
     /// Find the largest push survived in every direction: table, JSON, polar plot
     ///
     /// The robot stands in the scenario's posture and is pushed once, in lockstep; the impulse is found by bisection. Left behind are

@@ -2,26 +2,33 @@
 //!
 //! | file | what it does |
 //! |---|---|
-//! | [`feet`] | soles from shapes |
-//! | [`posture`] | a posture on one sole |
-//! | [`files`] | the texts of the two files |
+//! | [`feet`], [`tip`] | soles and tips of feet from shapes |
+//! | [`posture`], [`feet_posture`], [`arm_posture`] | a posture on one sole, on several feet, bolted down |
+//! | [`gauss_newton`] | what solves for it |
+//! | [`files`], [`scenario_text`] | the texts of the two files |
 //!
 //! What `init` writes runs as it is; the files are the user's from then on.
 
+pub mod arm_posture;
 pub mod feet;
+pub mod feet_posture;
 pub mod files;
+pub mod gauss_newton;
 pub mod posture;
+pub mod scenario_text;
+pub mod tip;
 
 use std::path::{Path, PathBuf};
 
 use delmpc_messages::MAX_JOINTS;
 use delmpc_robots::{
-    Companion, ImpossibleInertia, LoadOptions, RobotError, RobotModel, Rule, load_str, load_with,
+    BaseChoice, Companion, ImpossibleInertia, LoadOptions, RobotError, RobotModel, Rule, load_str, load_with,
 };
 
 use crate::check::weightless_joints;
-use crate::init::feet::{FoundFoot, find_feet};
-use crate::init::files::{Size, Table, scenario_text};
+use crate::init::feet::{FoundFoot, NoFeet, find_feet};
+use crate::init::files::Table;
+use crate::init::scenario_text::{Size, Support, scenario_text};
 use crate::output::{line, say};
 use crate::robot_controller::RobotController;
 use crate::setup::Setup;
@@ -39,6 +46,10 @@ pub enum Stand {
     Right,
     /// The left one.
     Left,
+    /// The two of a robot that has two.
+    Both,
+    /// All it has.
+    All,
 }
 
 /// Arguments of `delmpc init`.
@@ -46,9 +57,9 @@ pub enum Stand {
 pub struct InitArguments {
     /// Robot description
     pub urdf: PathBuf,
-    /// Foot it stands on
-    #[arg(long, value_enum, default_value = "right")]
-    pub stand: Stand,
+    /// Feet it stands on [default: right; all of more than two]
+    #[arg(long, value_enum)]
+    pub stand: Option<Stand>,
     /// Folder for the robot, its table and its scenario [default: the name of the URDF]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
@@ -113,12 +124,30 @@ pub fn init(arguments: &InitArguments) -> Result<Ended, Failure> {
 struct Made {
     robot: RobotModel,
     table: String,
-    sole: String,
+    stands: Stands,
     size: Size,
     warnings: Vec<String>,
 }
 
-fn make(urdf: &Path, text: &str, stand: Stand) -> Result<Made, Failure> {
+/// What it stands on.
+enum Stands {
+    OnSole(String),
+    OnAllFeet,
+    /// Bolted down; its hand.
+    Bolted(arm_posture::Hand),
+}
+
+impl Stands {
+    fn support(&self) -> Support<'_> {
+        match self {
+            Self::OnSole(sole) => Support::Sole(sole),
+            Self::OnAllFeet => Support::AllFeet,
+            Self::Bolted(_) => Support::Bolted,
+        }
+    }
+}
+
+fn make(urdf: &Path, text: &str, stand: Option<Stand>) -> Result<Made, Failure> {
     let named = |why: String| Failure::Input(format!("{}: {why}", urdf.display()));
     let mut table = Table::default();
     let bare = load_bare(urdf, &mut table)?;
@@ -129,23 +158,60 @@ fn make(urdf: &Path, text: &str, stand: Stand) -> Result<Made, Failure> {
     let load = |table: &Table| load_str(urdf, text, Some(&table.text()), &options).map_err(Failure::input);
     lock_joints(&bare, &mut table);
     let robot = load(&table)?;
-    table.feet = find_feet(&robot).map_err(|why| named(why.to_string()))?;
+    table.feet = match find_feet(&robot) {
+        Ok(feet) => feet,
+        Err(NoFeet::Fixed) => return bolted(urdf, text, stand, table, &robot),
+        Err(why) => return Err(named(why.to_string())),
+    };
     lock_most(&robot, &mut table);
-    let sole = stance(&table.feet, stand)
-        .ok_or_else(|| {
-            let found: Vec<&str> = table.feet.iter().map(|foot| foot.link.as_str()).collect();
-            named(format!("{} soles ({}), and none to stand on alone", found.len(), found.join(", ")))
-        })?
-        .to_owned();
+    let sole = stance(&table.feet, stand).map_err(named)?;
     let robot = load(&table)?;
     table.hands = files::hands(&robot);
-    let standing = posture::stand_on(&robot, &sole).map_err(named)?;
+    let standing = match &sole {
+        Some(sole) => posture::stand_on(&robot, sole),
+        None => feet_posture::stand_on_feet(&robot, &table.feet),
+    };
+    let standing = standing.map_err(named)?;
+    feet_posture::place_tips(&robot, &standing, &mut table.feet).map_err(|error| named(error.to_string()))?;
     table.posture = Some((standing.clone(), robot.joint_names.clone()));
     let robot = load(&table)?;
-    let size = Size::of(&robot, &sole, &standing);
+    let stands = sole.map_or(Stands::OnAllFeet, Stands::OnSole);
+    let size = Size::of(&robot, stands.support(), &standing);
     let mut warnings = robot.warnings.clone();
     warnings.extend(table.notes.iter().cloned());
-    Ok(Made { table: table.text(), robot, sole, size, warnings })
+    Ok(Made { table: table.text(), robot, stands, size, warnings })
+}
+
+/// A robot without feet.
+fn bolted(
+    urdf: &Path,
+    text: &str,
+    stand: Option<Stand>,
+    mut table: Table,
+    found: &RobotModel,
+) -> Result<Made, Failure> {
+    let named = |why: String| Failure::Input(format!("{}: {why}", urdf.display()));
+    if stand.is_some() {
+        return Err(named(format!("--stand: {}", NoFeet::Fixed)));
+    }
+    let base = match found.tree.is_floating() {
+        true => BaseChoice::Fixed(found.body_names.first().cloned().unwrap_or_default()),
+        false => BaseChoice::Auto,
+    };
+    let options = LoadOptions { base, ..LoadOptions::default() };
+    lock_most(found, &mut table);
+    let load = |table: &Table| load_str(urdf, text, Some(&table.text()), &options).map_err(Failure::input);
+    let robot = load(&table)?;
+    let hand = arm_posture::hand(&robot).ok_or_else(|| named("it has no joint that moves".to_owned()))?;
+    table.is_bolted = true;
+    table.hands = vec![hand.clone()];
+    let standing = arm_posture::bolted(&robot, &hand).map_err(named)?;
+    table.posture = Some((standing.clone(), robot.joint_names.clone()));
+    let robot = load(&table)?;
+    let size = Size::of_arm(&robot, &hand.0, &standing);
+    let mut warnings = robot.warnings.clone();
+    warnings.extend(table.notes.iter().cloned());
+    Ok(Made { table: table.text(), robot, stands: Stands::Bolted(hand), size, warnings })
 }
 
 /// Without a table, with impossible inertias accepted where it has to be.
@@ -183,7 +249,9 @@ fn lock_joints(robot: &RobotModel, table: &mut Table) {
         } else {
             continue;
         };
-        let at = 0.0_f64.clamp(limits.lower, limits.upper.max(limits.lower));
+        // A follower is where it is when the other joint is at 0.
+        let (_, _, offset) = robot.coordinate_map.row(joint);
+        let at = offset.clamp(limits.lower, limits.upper.max(limits.lower));
         table.locked.push((name.clone(), at, why));
     }
 }
@@ -220,15 +288,31 @@ fn lock_most(robot: &RobotModel, table: &mut Table) {
     }
 }
 
-/// The name of the sole to stand on.
-fn stance(feet: &[FoundFoot], stand: Stand) -> Option<&str> {
+/// The name of the one sole to stand on; nothing: on all of them.
+fn stance(feet: &[FoundFoot], stand: Option<Stand>) -> Result<Option<String>, String> {
+    let names = || feet.iter().map(|foot| foot.name.as_str()).collect::<Vec<_>>().join(", ");
     let wanted = match stand {
-        Stand::Right => "right",
-        Stand::Left => "left",
+        None if feet.len() > 2 => return Ok(None),
+        Some(Stand::All) if feet.len() > 1 => return Ok(None),
+        Some(Stand::Both) if feet.len() == 2 => return Ok(None),
+        Some(Stand::Both) => {
+            return Err(format!(
+                "--stand both: the robot has not two feet, but {} ({})",
+                feet.len(),
+                names()
+            ));
+        }
+        Some(Stand::Left) => "left",
+        None | Some(Stand::Right | Stand::All) => "right",
     };
-    match feet {
-        [only] => Some(&only.name),
-        _ => feet.iter().find(|foot| foot.name == wanted).map(|foot| foot.name.as_str()),
+    let only = (feet.len() == 1).then(|| feet.first()).flatten();
+    let sole = only.or_else(|| feet.iter().find(|foot| foot.name == wanted));
+    match sole {
+        Some(foot) if foot.tip.is_none() => Ok(Some(foot.name.clone())),
+        _ => Err(format!(
+            "the robot has the feet {}, and no sole `{wanted}` to stand on alone: --stand all",
+            names()
+        )),
     }
 }
 
@@ -239,12 +323,19 @@ fn with_a_ball(
     stem: &str,
     write: impl Fn(&Path, &str) -> Result<(), Failure>,
 ) -> Result<String, Failure> {
-    let Made { robot, sole, size, .. } = made;
-    let without = scenario_text(robot, stem, sole, size, None);
-    for (hand, at) in files::hands_at_home(robot, sole) {
+    let Made { robot, stands, size, .. } = made;
+    let support = stands.support();
+    let without = scenario_text(robot, stem, support, size, None);
+    let hands = match stands {
+        Stands::OnSole(sole) => files::hands_at_home(robot, sole),
+        // The controller has no task for hands there.
+        Stands::OnAllFeet => Vec::new(),
+        Stands::Bolted((hand, ..)) => vec![(hand.clone(), size.hand.into())],
+    };
+    for (hand, at) in hands {
         for direction in [[1.0, 0.0, 0.0], [0.7, 0.0, 0.7], [0.0, 0.0, 1.0], [0.7, 0.0, -0.7]] {
             let ball: [f64; 3] = std::array::from_fn(|axis| at[axis] + REACH_M * direction[axis]);
-            let text = scenario_text(robot, stem, sole, size, Some((&hand, ball)));
+            let text = scenario_text(robot, stem, support, size, Some((&hand, ball)));
             write(file, &text)?;
             let setup = Setup::read(file, &[])?;
             let left = RobotController::new(&setup)?.out_of_reach_m();

@@ -12,6 +12,7 @@ use delmpc_horizon::stage_grid::StageGrid;
 use delmpc_horizon::step_plan::Step;
 use delmpc_mechanics::contact_stage::BoundaryState;
 use delmpc_mechanics::kinematics::{Configuration, Kinematics, base_pose_from_link};
+use delmpc_mechanics::prelude::RigidTransform;
 use delmpc_scenario::{ControllerKind, GaitKind, GaitSettings};
 use nalgebra::Vector3;
 
@@ -22,6 +23,11 @@ use crate::setup::Setup;
 const LIFT_PART: f64 = 0.08;
 const POINT_LIFT_PART: f64 = 0.2;
 const DEPTH_PART: f64 = 0.004;
+/// Periods of gaits on two and on four feet, in units of the time `√(height / g)` in which an inverted pendulum of the robot's size falls.
+const PERIOD_ON_TWO: f64 = 4.2;
+const PERIOD_ON_FOUR: f64 = 4.4;
+/// m/s².
+const GRAVITY: f64 = 9.81;
 
 /// The robot as the horizon has it.
 ///
@@ -66,7 +72,7 @@ pub fn robot(setup: &Setup) -> Result<LeggedRobot, String> {
 /// Everything that is chosen.
 ///
 /// # Errors
-/// In words: a gait of a robot that does not have four feet.
+/// In words: a gait that the robot's number of feet does not have.
 pub fn config(setup: &Setup, model: &LeggedModel) -> Result<LeggedConfig, String> {
     let scenario = &setup.scenario;
     let settings = &scenario.controller;
@@ -109,7 +115,7 @@ pub fn config(setup: &Setup, model: &LeggedModel) -> Result<LeggedConfig, String
             depth_m: or(legged.swing_depth_m, DEPTH_PART),
         },
         crouch_m: legged.crouch_m,
-        motion: motion(setup, model)?,
+        motion: motion(setup, model, height)?,
         qp: core_config.qp,
         fallback: core_config.fallback,
         max_state_age_s: settings.max_state_age_s,
@@ -134,11 +140,11 @@ fn mass_centre_height(model: &LeggedModel) -> Result<f64, String> {
     Ok(kinematics.mass_centre_of_tree_w(&model.tree).z)
 }
 
-fn motion(setup: &Setup, model: &LeggedModel) -> Result<Motion, String> {
+fn motion(setup: &Setup, model: &LeggedModel, height: f64) -> Result<Motion, String> {
     let scenario = &setup.scenario;
     if let Some(gait) = &scenario.gait {
         return Ok(Motion::Gait(GaitCommand {
-            gait: four_footed(gait, model)?,
+            gait: self::gait(gait, model, height)?,
             velocity: [gait.speed_m_s, gait.side_speed_m_s],
             yaw_rate: gait.yaw_rate_rad_s,
             start_s: gait.start_s,
@@ -163,36 +169,42 @@ fn motion(setup: &Setup, model: &LeggedModel) -> Result<Motion, String> {
     Ok(Motion::Steps(steps))
 }
 
-/// The gait, its phases in the order of the robot's feet: front from back and left from right by where they stand at home.
-fn four_footed(settings: &GaitSettings, model: &LeggedModel) -> Result<Gait, String> {
-    let count = model.feet.len();
-    if count != 4 {
-        return Err(format!(
-            "`gait.kind`: gaits are for four feet, and this robot has {count}: give it steps, [[step]]"
-        ));
-    }
-    let of_four = match settings.kind {
-        GaitKind::Trot | GaitKind::FlyingTrot => Gait::TROT,
-        GaitKind::Walk => Gait::WALK,
-        GaitKind::Pace => Gait::PACE,
-        GaitKind::Bound => Gait::BOUND,
-        GaitKind::Jump => Gait::JUMP,
-    };
+/// The gait, its phases in the order of the robot's feet, by where they stand at home: of four feet front from back and left from right;
+/// of two the right one first.
+fn gait(settings: &GaitSettings, model: &LeggedModel, height: f64) -> Result<Gait, String> {
     let mut kinematics = Kinematics::new(&model.tree);
     let home = &model.posture;
     let configuration = Configuration::floating(home.base_pose_w(), &home.q);
     kinematics.update_positions(&model.tree, &configuration).map_err(|error| error.to_string())?;
-    let phase = model.feet.iter().map(|foot| {
-        let sole = kinematics.link_poses_w()[foot.body] * foot.sole;
-        let place = home.base_pose_w().inverse().transform_point(&sole.translation);
-        let index = 2 * usize::from(place.x < 0.0) + usize::from(place.y < 0.0);
-        of_four[index]
-    });
-    Ok(Gait {
-        period_s: settings.period_s,
-        swing_s: settings.period_s * (1.0 - settings.duty),
-        phase: phase.collect(),
-    })
+    let soles: Vec<RigidTransform> =
+        model.feet.iter().map(|foot| kinematics.link_poses_w()[foot.body] * foot.sole).collect();
+    // From their middle, in the heading of the first: root links have axes of all kinds.
+    let middle = soles.iter().map(|sole| sole.translation).sum::<Vector3<f64>>() / soles.len().max(1) as f64;
+    let places = soles.iter().map(|sole| soles[0].rotation.tr_mul(&(sole.translation - middle)));
+    let phase: Vec<f64> = match (soles.len(), settings.kind) {
+        (4, kind) => {
+            let of_four = match kind {
+                GaitKind::Trot | GaitKind::FlyingTrot => Gait::TROT,
+                GaitKind::Walk => Gait::WALK,
+                GaitKind::Pace => Gait::PACE,
+                GaitKind::Bound => Gait::BOUND,
+                GaitKind::Jump => Gait::JUMP,
+            };
+            places.map(|place| of_four[2 * usize::from(place.x < 0.0) + usize::from(place.y < 0.0)]).collect()
+        }
+        (2, GaitKind::Walk) => places.map(|place| if place.y < 0.0 { 0.0 } else { 0.5 }).collect(),
+        (2, GaitKind::Jump) => vec![0.0; 2],
+        (count, _) => {
+            return Err(format!(
+                "`gait.kind`: two feet walk or jump, four feet have all gaits, and this robot has {count}: give it steps, [[step]]"
+            ));
+        }
+    };
+    let period_s = match settings.period_s {
+        0.0 => (if soles.len() == 2 { PERIOD_ON_TWO } else { PERIOD_ON_FOUR }) * (height / GRAVITY).sqrt(),
+        period_s => period_s,
+    };
+    Ok(Gait { period_s, swing_s: period_s * (1.0 - settings.duty), phase })
 }
 
 /// Joint torques that hold the robot on all its feet at the start.

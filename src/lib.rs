@@ -13,6 +13,7 @@
 //! | [`simulated_robot`], [`robot_controller`] | plant and controller made from a setup |
 //! | [`faults`] | faults of messages on purpose |
 //! | [`run_folder`] | the folder a run leaves behind |
+//! | [`support`] | the hull of the feet, and what an inverted pendulum on it survives |
 //! | [`supervisor`] | starts, watches and ends the two processes |
 //! | [`part`] | what the two processes have in common |
 //! | [`plant_process`] | the loop of the plant process |
@@ -25,6 +26,7 @@
 //! | [`mod@init`] | companion table and scenario of a robot that has none |
 //! | [`mesh_file`] | mesh files of a robot, found and read |
 //! | [`drawing`] | a robot in its postures as SVG |
+//! | [`mod@keys`] | every key of a scenario, from the types that read it |
 //! | [`completions`] | what a shell needs to complete our words |
 //! | [`log`], [`log_viewer`] | the log of states, commands and truth, and what shows the robot to viewers of logs |
 //! | [`log_queue`], [`log_file`], [`log_command`], [`log_reader`] | its way to the file, the file, commands in it, and its way back |
@@ -45,6 +47,7 @@ pub mod drawing;
 pub mod faults;
 pub mod init;
 pub mod input_file;
+pub mod keys;
 pub mod legged_metrics;
 pub mod legged_robot;
 pub mod log;
@@ -80,6 +83,7 @@ pub mod steering;
 pub mod summary;
 pub mod summary_table;
 pub mod supervisor;
+pub mod support;
 pub mod tape;
 pub mod timing;
 pub mod truth;

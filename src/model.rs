@@ -78,7 +78,7 @@ pub fn model(arguments: &ModelArguments) -> Result<Ended, Failure> {
                 let taken = |name: &String| robot.posture(name).is_some();
                 let names = (1..).map(|n| if n == 1 { "stand".to_owned() } else { format!("stand_{n}") });
                 let name = names.take(100).find(|name| !taken(name)).unwrap_or_default();
-                print(&posture_text(&name, &standing, &robot.joint_names))?;
+                print(&posture_text(&name, &standing, &robot.joint_names, true))?;
                 return Ok(Ended::Well);
             }
             print(&printable(&table(&robot)?))?;

@@ -29,7 +29,8 @@ pub struct Motion<'a> {
 pub struct Observer {
     tree: KinematicTree,
     kinematics: Kinematics,
-    sole: Attachment,
+    /// Of the sole it stands on, if it does not hang on the world.
+    sole: Option<Attachment>,
     soles: Vec<Attachment>,
     hand: Option<Attachment>,
     effort: Vec<f64>,
@@ -43,11 +44,14 @@ impl Observer {
     pub fn new(setup: &Setup) -> Result<Self, Failure> {
         let (robot, scenario) = (&setup.robot, &setup.scenario);
         let missing = || Failure::Input(format!("`robot.stance`: {} is on no link", scenario.robot.stance));
-        let sole = robot.sole(scenario.robot.stance.first()).ok_or_else(missing)?;
+        let sole = robot.sole(scenario.robot.stance.first()).and_then(|sole| robot.frame(&sole.frame));
+        if sole.is_none() && robot.tree.is_floating() {
+            return Err(missing());
+        }
         Ok(Self {
             tree: robot.tree.clone(),
             kinematics: Kinematics::new(&robot.tree),
-            sole: *robot.frame(&sole.frame).ok_or_else(missing)?,
+            sole: sole.copied(),
             soles: robot.soles.iter().filter_map(|sole| robot.frame(&sole.frame).copied()).collect(),
             hand: scenario.reach.as_ref().and_then(|reach| robot.frame(&reach.hand)).copied(),
             effort: robot.limits.iter().map(|limit| limit.effort).collect(),
@@ -68,18 +72,23 @@ impl Observer {
         let loads = motion.torque.iter().zip(&self.effort);
         truth.torque_ratio = loads.map(|(torque, effort)| torque.abs() / effort).fold(0.0, f64::max);
 
-        let base = base_pose_from_link(&self.tree, motion.base_link_pose_w);
-        let twist_w = motion.base_link_pose_w.transform_twist(motion.base_twist_b);
-        let configuration = Configuration::floating(base, motion.position);
-        let velocity = Velocity::floating(twist_w, motion.velocity);
+        let floats = self.tree.is_floating();
+        let (configuration, velocity) = if floats {
+            let base = base_pose_from_link(&self.tree, motion.base_link_pose_w);
+            let twist_w = motion.base_link_pose_w.transform_twist(motion.base_twist_b);
+            (Configuration::floating(base, motion.position), Velocity::floating(twist_w, motion.velocity))
+        } else {
+            (Configuration::fixed(motion.position), Velocity::fixed(motion.velocity))
+        };
         // Only slices of a wrong length could be refused, and these are the tree's own.
         if self.kinematics.update(&self.tree, &configuration, &velocity).is_err() {
             return;
         }
         truth.com_w = self.kinematics.mass_centre_of_tree_w(&self.tree).into();
         truth.com_velocity_w = self.kinematics.mass_centre_velocity_w(&self.tree).into();
-        let sole = self.pose_w(&self.sole);
-        truth.sole_position_w = sole.translation.into();
+        if let Some(sole) = &self.sole {
+            truth.sole_position_w = self.pose_w(sole).translation.into();
+        }
         truth.n_feet = self.soles.len().min(truth.foot_position_w.len()) as u32;
         for (sole, place) in self.soles.iter().zip(&mut truth.foot_position_w) {
             *place = self.pose_w(sole).translation.into();

@@ -24,7 +24,6 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use delmpc_controller_process::stop::StopFlag;
-use delmpc_mechanics::kinematics::{Configuration, Kinematics};
 use delmpc_scenario::{Clock, PushSettings};
 use indicatif::{ProgressBar, ProgressStyle};
 use nalgebra::Vector2;
@@ -36,6 +35,7 @@ use crate::output::{line, print};
 use crate::run_folder::claim_or;
 use crate::setup::{Setup, scenario_file};
 use crate::summary::Summary;
+use crate::support::Support;
 use crate::verdict::{Ended, Failure};
 
 mod plot;
@@ -62,8 +62,8 @@ pub struct PushMapArguments {
     /// Controllers to compare: mpc, static-lqr
     #[arg(long, value_name = "KIND", value_delimiter = ',', default_value = "mpc")]
     pub controller: Vec<String>,
-    /// Links that are pushed, at their mass centres
-    #[arg(long, value_name = "LINK", value_delimiter = ',', default_value = "utorso")]
+    /// Links that are pushed, at their mass centres [default: that of the scenario's first push, else the heaviest]
+    #[arg(long, value_name = "LINK", value_delimiter = ',')]
     pub link: Vec<String>,
     /// Directions, evenly spread, from straight ahead to the left
     #[arg(long, default_value_t = 8)]
@@ -187,7 +187,9 @@ fn trial_setup(arguments: &PushMapArguments) -> Result<Setup, Failure> {
 }
 
 fn searches(arguments: &PushMapArguments, setup: &Setup) -> Result<Vec<Search>, Failure> {
-    for link in &arguments.link {
+    let usual: Vec<String> = usual_link(setup).into_iter().collect();
+    let links = if arguments.link.is_empty() { &usual } else { &arguments.link };
+    for link in links {
         if setup.robot.link(link).and_then(|link| link.body).is_none() {
             return Err(Failure::Input(format!("--link {link}: the robot has no such moving link")));
         }
@@ -197,7 +199,7 @@ fn searches(arguments: &PushMapArguments, setup: &Setup) -> Result<Vec<Search>, 
     }
     let mut searches = Vec::new();
     for controller in &arguments.controller {
-        for link in &arguments.link {
+        for link in links {
             for direction in 0..arguments.directions {
                 let angle_rad = std::f64::consts::TAU * direction as f64 / arguments.directions as f64;
                 searches.push(Search { controller: controller.clone(), link: link.clone(), angle_rad });
@@ -368,35 +370,22 @@ fn trial(
     }
 }
 
-/// Impulse (N s) after which the capture point is at the edge of the stance sole.
+/// Impulse (N s) after which the capture point is at the edge of the support.
 fn capture_limit(setup: &Setup, angle_rad: f64) -> f64 {
-    let limit = || {
-        let robot = &setup.robot;
-        let posture = robot.posture(&setup.scenario.robot.posture)?;
-        let sole = robot.sole(setup.scenario.robot.stance.first())?;
-        let rooted = robot.rooted_at(&sole.frame).ok()?;
-        let tree = &rooted.model.tree;
-        let mut kinematics = Kinematics::new(tree);
-        let q = &rooted.model.posture(&posture.name)?.q;
-        kinematics.update_positions(tree, &Configuration::fixed(q)).ok()?;
-        let com = kinematics.mass_centre_of_tree_w(tree);
-        let direction = Vector2::new(angle_rad.cos(), angle_rad.sin());
-        let distance = edge_distance(&sole.polygon, com.xy(), direction)?;
-        let frequency = (tree.gravity_w().norm() / com.z).sqrt();
-        Some(tree.total_mass() * frequency * distance)
-    };
-    limit().filter(|limit| limit.is_finite() && *limit > 0.0).unwrap_or(10.0)
+    let (robot, settings) = (&setup.robot, &setup.scenario.robot);
+    let support = Support::new(robot, &settings.posture, settings.stance.names());
+    let direction = Vector2::new(angle_rad.cos(), angle_rad.sin());
+    support.and_then(|support| support.capture_limit(robot, direction)).unwrap_or(10.0)
 }
 
-/// Distance from a point inside a convex polygon to its edge in a direction.
-fn edge_distance(polygon: &[Vector2<f64>], from: Vector2<f64>, direction: Vector2<f64>) -> Option<f64> {
-    let corners = polygon.iter().zip(polygon.iter().cycle().skip(1));
-    let distances = corners.filter_map(|(a, b)| {
-        let outward = Vector2::new(b.y - a.y, a.x - b.x);
-        let speed = outward.dot(&direction);
-        (speed > 1e-12).then(|| outward.dot(&(a - from)) / speed)
-    });
-    distances.min_by(f64::total_cmp)
+/// The link that is pushed when none is named: that of the scenario's first push, else the heaviest.
+fn usual_link(setup: &Setup) -> Option<String> {
+    let robot = &setup.robot;
+    if let Some(push) = setup.scenario.push.iter().find(|push| !push.link.is_empty()) {
+        return Some(push.link.clone());
+    }
+    let bodies = robot.tree.bodies().iter().zip(&robot.body_names);
+    bodies.max_by(|a, b| a.0.inertia.mass.total_cmp(&b.0.inertia.mass)).map(|(_, name)| name.clone())
 }
 
 /// One line per controller, link and direction.
@@ -449,20 +438,6 @@ mod tests {
     use std::path::Path;
 
     use super::*;
-
-    #[test]
-    fn the_distance_to_the_edge_is_along_the_direction() {
-        let sole: Vec<Vector2<f64>> = [(0.1, -0.05), (0.1, 0.05), (-0.1, 0.05), (-0.1, -0.05)]
-            .map(|(x, y)| Vector2::new(x, y))
-            .to_vec();
-        let from = Vector2::new(0.02, 0.01);
-        let distance = |x: f64, y: f64| edge_distance(&sole, from, Vector2::new(x, y)).unwrap();
-        assert!((distance(1.0, 0.0) - 0.08).abs() < 1e-12);
-        assert!((distance(0.0, -1.0) - 0.06).abs() < 1e-12);
-        assert!((distance(-1.0, 0.0) - 0.12).abs() < 1e-12);
-        let diagonal = distance(0.5_f64.sqrt(), 0.5_f64.sqrt());
-        assert!((diagonal - 0.04 * 2.0_f64.sqrt()).abs() < 1e-12);
-    }
 
     fn arguments(seeds: u64) -> PushMapArguments {
         use clap::Parser;

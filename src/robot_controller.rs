@@ -2,12 +2,14 @@
 
 use delmpc_controller_core::config::{ConstraintConfig, ControllerConfig};
 use delmpc_controller_core::cycle::Clock as CycleClock;
+use delmpc_controller_core::errors::ControlError;
 use delmpc_controller_core::legged::LeggedController;
 use delmpc_controller_core::prelude as core;
 use delmpc_controller_core::prelude::{BodyPoint, ControllerModel, JointLimits, Reach, Sensing, TaskWeights};
 use delmpc_controller_process::clock::monotonic_ns;
 use delmpc_controller_process::controller_loop::Controller;
 use delmpc_estimation::prelude::{EstimatorConfig, EstimatorModel, FootModel};
+use delmpc_lq::errors::LqError;
 use delmpc_mechanics::reroot::Rerooted;
 use delmpc_messages::{Command, PlantState};
 use delmpc_robots::RobotModel;
@@ -78,8 +80,9 @@ impl<K> RobotController<K> {
             return Ok(Self { cycle: Cycle::Legged(Box::new(controller)), clock });
         }
         let model = model(setup).map_err(|error| refused(&error))?;
-        let mut controller =
-            core::Controller::new(model, config(&setup.scenario)).map_err(|error| refused(&error))?;
+        let joints = model.message_joint.clone();
+        let mut controller = core::Controller::new(model, config(setup))
+            .map_err(|error| refused(&with_joint(&setup.robot, &joints, &error)))?;
         controller.set_origin_ns(0);
         Ok(Self { cycle: Cycle::OneFoot(Box::new(controller)), clock })
     }
@@ -138,9 +141,37 @@ impl<K: CycleClock> Controller for RobotController<K> {
     }
 }
 
+/// An error of the controller, with the joint that its index stands for: `joints` has the robot's joint for every one of the controller's.
+fn with_joint(robot: &RobotModel, joints: &[usize], error: &ControlError) -> String {
+    let index = match error {
+        // States are positions, then velocities.
+        ControlError::Lq(LqError::NoStabilisingSolution { state, .. }) => Some(state % joints.len().max(1)),
+        ControlError::Value {
+            quantity: "effort limit" | "velocity limit" | "position limit" | "posture",
+            index,
+            ..
+        } => Some(*index),
+        _ => None,
+    };
+    let joint = index.and_then(|index| joints.get(index)).copied();
+    let Some((joint, limit)) = joint.and_then(|joint| Some((joint, robot.limits.get(joint)?))) else {
+        return error.to_string();
+    };
+    let first = robot.tree.first_joint_body();
+    let mass = robot.tree.bodies().get(first + joint).map_or(0.0, |body| body.inertia.mass);
+    format!(
+        "{error}; that is joint `{}`, with effort {} and a link of {mass} kg",
+        robot.joint_names.get(joint).map_or("?", String::as_str),
+        limit.effort
+    )
+}
+
 /// The robot fixed at its stance sole.
 fn model(setup: &Setup) -> Result<ControllerModel, String> {
     let (robot, scenario) = (&setup.robot, &setup.scenario);
+    if !robot.tree.is_floating() {
+        return bolted(setup);
+    }
     let rooted = robot.rooted_at(setup.stance_frame()).map_err(|error| error.to_string())?;
     let standing = &rooted.model;
     let posture = standing.posture(&scenario.robot.posture).ok_or("the posture is missing")?;
@@ -157,6 +188,16 @@ fn model(setup: &Setup) -> Result<ControllerModel, String> {
         posture: posture.q.clone(),
         sensing: Some(sensing(setup, rooted.rerooted)?),
     })
+}
+
+/// A robot that is bolted to the world: no sole, nothing to feel of it, no other foot.
+fn bolted(setup: &Setup) -> Result<ControllerModel, String> {
+    let (robot, scenario) = (&setup.robot, &setup.scenario);
+    let posture = robot.posture(&scenario.robot.posture).ok_or("the posture is missing")?;
+    let (hash, limits) = (setup.joint_set_hash(), joint_limits(robot));
+    let hand = scenario.reach.as_ref().and_then(|reach| point(robot, &reach.hand));
+    let standing = ControllerModel::standing(robot.tree.clone(), hash, limits, Vec::new(), posture.q.clone());
+    Ok(ControllerModel { hand, ..standing })
 }
 
 /// What the robot feels of its base and feet.
@@ -241,7 +282,10 @@ fn point(robot: &RobotModel, frame: &str) -> Option<BodyPoint> {
     Some(BodyPoint { body: frame.body?, position: frame.pose.translation })
 }
 
-fn config(scenario: &Scenario) -> ControllerConfig {
+fn config(setup: &Setup) -> ControllerConfig {
+    let scenario = &setup.scenario;
+    // Where the mass centre of a robot is that cannot fall counts for nothing.
+    let balances = f64::from(u8::from(setup.robot.tree.is_floating()));
     let settings = &scenario.controller;
     let period_s = 1.0 / settings.mpc_rate_hz;
     let weights = &settings.weights;
@@ -260,9 +304,9 @@ fn config(scenario: &Scenario) -> ControllerConfig {
             posture: weights.posture_per_rad2,
             joint_speed: weights.joint_speed_s2_per_rad2,
             torque: weights.torque_per_limit2,
-            com: weights.com_per_m2,
-            com_velocity: weights.com_velocity_s2_per_m2,
-            spin: weights.spin_per_n2m2s2,
+            com: weights.com_per_m2.map(|weight| balances * weight),
+            com_velocity: weights.com_velocity_s2_per_m2.map(|weight| balances * weight),
+            spin: weights.spin_per_n2m2s2.map(|weight| balances * weight),
             hand: weights.hand_per_m2,
             hand_velocity: weights.hand_velocity_s2_per_m2,
             swing_foot: weights.swing_foot_per_m2,

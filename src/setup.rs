@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use delmpc_controller_core::config::ControllerConfig;
 use delmpc_mechanics::prelude::RigidTransform;
 use delmpc_messages::{JointSetHasher, MAX_JOINTS, joint_set_hash};
-use delmpc_robots::{ImpossibleInertia, LoadOptions, RobotModel, load_with};
-use delmpc_scenario::{Document, Scenario, Stance};
+use delmpc_robots::{BaseChoice, ImpossibleInertia, LoadOptions, RobotError, RobotModel, load_with};
+use delmpc_scenario::{Base, Document, Scenario, Stance};
 
 use crate::check::Findings;
 use crate::start::Start;
@@ -62,7 +62,7 @@ impl Setup {
             _ => return Ok((None, findings)),
         };
         let urdf = find_robot(file, &scenario.robot.urdf);
-        let mut robot = match load_with(&urdf, &load_options(&scenario)) {
+        let mut robot = match load_robot(&urdf, &scenario) {
             Ok(robot) => robot,
             Err(error) => {
                 findings.errors.push(error.to_string());
@@ -193,10 +193,11 @@ impl Setup {
     fn check_names(&self) -> Vec<String> {
         let Self { scenario, robot, .. } = self;
         let mut wrong = Vec::new();
-        if !robot.tree.is_floating() {
-            wrong.push(
-                "`robot.urdf`: this robot is fixed to the world; a plant needs one that can fall".to_owned(),
-            );
+        if !robot.tree.is_floating() && scenario.robot.base == Base::Floating {
+            wrong.push("`robot.urdf`: this robot is fixed to the world: robot.base = \"fixed\"".to_owned());
+        }
+        if !robot.tree.is_floating() && self.is_legged() {
+            wrong.push("`robot.base` = \"fixed\": a robot that is bolted down neither steps nor stands on several feet".to_owned());
         }
         wrong.extend(self.check_stages().err());
         let joints = robot.joint_names.len();
@@ -214,7 +215,9 @@ impl Setup {
             }
         };
         let soles: Vec<&str> = robot.soles.iter().map(|sole| sole.name.as_str()).collect();
-        for name in scenario.robot.stance.names() {
+        // A robot that is bolted down stands on nothing.
+        let asked = if robot.tree.is_floating() { scenario.robot.stance.names() } else { &[] };
+        for name in asked {
             one_of("robot.stance", "sole", name, soles.clone());
         }
         for (index, step) in scenario.step.iter().enumerate() {
@@ -276,6 +279,18 @@ pub(crate) fn load_options(scenario: &Scenario) -> LoadOptions {
         false => ImpossibleInertia::Refuse,
     };
     LoadOptions { impossible_inertia, ..LoadOptions::default() }
+}
+
+/// The robot as its scenario wants it: floating, or bolted down at its root link.
+pub(crate) fn load_robot(urdf: &Path, scenario: &Scenario) -> Result<RobotModel, RobotError> {
+    let options = load_options(scenario);
+    let robot = load_with(urdf, &options)?;
+    match robot.body_names.first() {
+        Some(root) if scenario.robot.base == Base::Fixed && robot.tree.is_floating() => {
+            load_with(urdf, &LoadOptions { base: BaseChoice::Fixed(root.clone()), ..options })
+        }
+        _ => Ok(robot),
+    }
 }
 
 /// The robot file: relative to the scenario, or else to the working folder.

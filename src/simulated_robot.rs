@@ -3,7 +3,7 @@
 use delmpc_mechanics::inverse_dynamics::{InverseDynamicsWorkspace, gravity_force_into};
 use delmpc_mechanics::kinematics::{Configuration, Kinematics};
 use delmpc_mechanics::mass_matrix::{MassMatrixWorkspace, mass_matrix_into};
-use delmpc_mechanics::prelude::{RigidTransform, State};
+use delmpc_mechanics::prelude::{KinematicTree, RigidTransform, State};
 use delmpc_messages::{ClockKind, Command, PlantState};
 use delmpc_plant::prelude as simulation;
 use delmpc_plant::prelude::{
@@ -12,7 +12,7 @@ use delmpc_plant::prelude::{
     SensorConfig, Terrain, TerrainBox, TerrainGap, WatchdogConfig,
 };
 use delmpc_robots::{Geometry, RobotModel, ShapeRole};
-use delmpc_scenario::{Clock, PushSettings, Scenario};
+use delmpc_scenario::{Base, Clock, PushSettings, Scenario};
 use nalgebra::Vector3;
 
 use crate::legged_robot;
@@ -180,22 +180,14 @@ struct Holding {
 impl Holding {
     fn new(setup: &Setup, state: &State) -> Result<Self, String> {
         let robot = &setup.robot;
+        if !robot.tree.is_floating() {
+            return Self::bolted(setup, state);
+        }
         let rooted = robot.rooted_at(setup.stance_frame()).map_err(|error| error.to_string())?;
         let tree = &rooted.model.tree;
         let posture = rooted.model.posture(&setup.scenario.robot.posture).ok_or("no posture")?;
-        let mut kinematics = Kinematics::new(tree);
         let joints = tree.joint_count();
-        let (mut gravity, mut mass_matrix) = (vec![0.0; joints], vec![0.0; joints * joints]);
-        kinematics
-            .update_positions(tree, &Configuration::fixed(&posture.q))
-            .and_then(|()| {
-                gravity_force_into(tree, &kinematics, &mut InverseDynamicsWorkspace::new(tree), &mut gravity)
-            })
-            .and_then(|()| {
-                mass_matrix_into(tree, &kinematics, &mut MassMatrixWorkspace::new(tree), &mut mass_matrix)
-            })
-            .map_err(|error| error.to_string())?;
-        let inertia: Vec<f64> = (0..joints).map(|joint| mass_matrix[joint * joints + joint]).collect();
+        let (gravity, inertia) = weight_and_inertia(tree, &posture.q)?;
         let floating = |rooted_values: &[f64]| {
             let mut values = vec![0.0; joints];
             rooted
@@ -212,16 +204,46 @@ impl Holding {
     }
 }
 
+impl Holding {
+    /// Of a robot that is bolted to the world.
+    fn bolted(setup: &Setup, state: &State) -> Result<Self, String> {
+        let (torque, inertia) = weight_and_inertia(&setup.robot.tree, &state.q)?;
+        let gains = HoldingGains::new(&setup.robot.tree, state, &inertia, setup.scenario.plant.step_s);
+        Ok(Self { torque, gains: gains.map_err(|error| error.to_string())? })
+    }
+}
+
+/// Of a fixed tree at rest: the torques that hold it, and what every joint turns (diagonal of the mass matrix).
+fn weight_and_inertia(tree: &KinematicTree, q: &[f64]) -> Result<(Vec<f64>, Vec<f64>), String> {
+    let mut kinematics = Kinematics::new(tree);
+    let joints = tree.joint_count();
+    let (mut gravity, mut mass_matrix) = (vec![0.0; joints], vec![0.0; joints * joints]);
+    kinematics
+        .update_positions(tree, &Configuration::fixed(q))
+        .and_then(|()| {
+            gravity_force_into(tree, &kinematics, &mut InverseDynamicsWorkspace::new(tree), &mut gravity)
+        })
+        .and_then(|()| {
+            mass_matrix_into(tree, &kinematics, &mut MassMatrixWorkspace::new(tree), &mut mass_matrix)
+        })
+        .map_err(|error| error.to_string())?;
+    Ok((gravity, (0..joints).map(|joint| mass_matrix[joint * joints + joint]).collect()))
+}
+
 fn model(setup: &Setup) -> Result<PlantModel, Failure> {
     let (robot, scenario) = (&setup.robot, &setup.scenario);
-    let contacts = robot.contacts.iter().map(|contact| {
+    // What is bolted down touches nothing that moves.
+    let floats = robot.tree.is_floating();
+    let touching = robot.contacts.iter().filter(|contact| floats || contact.body.is_some());
+    let contacts = touching.map(|contact| {
         let body = contact.body.ok_or_else(|| on_no_body(&contact.name))?;
         let (point, radius, friction) = (contact.position, contact.radius, scenario.plant.friction);
         Ok(ContactPoint { body, point, radius, friction })
     });
     let mut contacts = contacts.collect::<Result<Vec<_>, Failure>>()?;
     contacts.extend(body_contacts(setup));
-    let feet = robot.soles.iter().map(|sole| {
+    let soles = robot.soles.iter().filter(|_| floats);
+    let feet = soles.map(|sole| {
         let frame = robot.frame(&sole.frame).ok_or_else(|| on_no_body(&sole.frame))?;
         Ok(Foot {
             body: frame.body.ok_or_else(|| on_no_body(&sole.frame))?,
@@ -323,9 +345,22 @@ fn config(setup: &Setup, holding: &Holding, start: &Start) -> Result<PlantConfig
             damping: holding.gains.damping.clone(),
             ..WatchdogConfig::default()
         },
-        monitor: MonitorConfig { stance_foot: stance.unwrap_or(0), ..MonitorConfig::default() },
+        monitor: monitor(setup, stance.unwrap_or(0)),
         seed: scenario.seed,
     })
+}
+
+/// A robot that is bolted down cannot fall: its first link may turn and its mass centre sink as they like.
+fn monitor(setup: &Setup, stance_foot: usize) -> MonitorConfig {
+    let usual = MonitorConfig { stance_foot, ..MonitorConfig::default() };
+    match setup.robot.tree.is_floating() {
+        true => usual,
+        false => MonitorConfig {
+            min_com_height_share: f64::NEG_INFINITY,
+            max_base_tilt: std::f64::consts::PI,
+            ..usual
+        },
+    }
 }
 
 fn terrain(scenario: &Scenario) -> Terrain {
@@ -335,7 +370,9 @@ fn terrain(scenario: &Scenario) -> Terrain {
         yaw: block.yaw_rad,
     });
     let gaps = scenario.terrain.gaps.iter().map(|gap| TerrainGap { min: gap.min_m, max: gap.max_m });
-    Terrain { plane_height: Some(0.0), boxes: boxes.collect(), gaps: gaps.collect(), slope: slope(scenario) }
+    // The height of the floor under a mount is nobody's to know.
+    let plane_height = (scenario.robot.base == Base::Floating).then_some(0.0);
+    Terrain { plane_height, boxes: boxes.collect(), gaps: gaps.collect(), slope: slope(scenario) }
 }
 
 /// Spring and damper under every contact such that the robot's weight on its stance sole sinks as far as the scenario says.
@@ -360,7 +397,7 @@ fn sensors(setup: &Setup) -> Result<SensorConfig, Failure> {
     let mounting = believed * misalignment;
     let there = SensorConfig {
         delay: settings.delay_s,
-        has_inertial_unit: settings.inertial_unit,
+        has_inertial_unit: settings.inertial_unit && setup.robot.tree.is_floating(),
         inertial_unit: InertialUnitConfig { body, mounting, ..InertialUnitConfig::PERFECT },
         has_foot_wrench: settings.foot_wrench,
         has_motion_capture: settings.motion_capture,

@@ -5,12 +5,15 @@
 //! | world | of the scenario; the ground is tilted about it | z up |
 //! | stance frame | origin of the stance sole at the start | z up, x where the sole's x axis points horizontally |
 //!
+//! The stance frame of a robot that is bolted down is the frame of its root link, which is the world's too.
+//!
 //! Balls and pushes are given in the stance frame: turning or moving the whole robot changes nothing for it.
 
 use delmpc_mechanics::errors::ModelError;
 use delmpc_mechanics::kinematics::{Configuration, Kinematics};
 use delmpc_mechanics::prelude::RigidTransform;
 use delmpc_mechanics::spatial::exp_rotation;
+use delmpc_robots::Posture;
 use delmpc_scenario::Scenario;
 use nalgebra::{Matrix3, Vector3};
 
@@ -36,6 +39,9 @@ impl Start {
     pub fn new(setup: &Setup) -> Result<Self, Failure> {
         let Setup { robot, scenario, .. } = setup;
         let posture = robot.posture(&scenario.robot.posture);
+        if let (Some(posture), false) = (posture, robot.tree.is_floating()) {
+            return Ok(Self::bolted(setup, posture));
+        }
         let standing = posture.and_then(|posture| Some((posture, robot.base_pose_w(posture)?)));
         let (posture, base_pose) = standing.ok_or_else(|| {
             let name = &scenario.robot.posture;
@@ -63,13 +69,28 @@ impl Start {
         let ground = RigidTransform { rotation: slope(scenario), translation: Vector3::zeros() };
         let base_pose_w = ground * moved * turn * RigidTransform::from_translation(-turned_about) * base_pose;
         let mut q = posture.q.clone();
-        for (name, offset) in &start.joint_offset {
-            if let Some(joint) = robot.joint(name) {
-                q[joint] += offset;
-            }
-        }
+        offset_joints(setup, &mut q);
         let stance_frame_w = levelled(&sole(base_pose_w, &q)?);
         Ok(Self { base_pose_w, q, stance_frame_w })
+    }
+}
+
+impl Start {
+    /// Of a robot that is bolted to the world: only its joints may begin elsewhere.
+    fn bolted(setup: &Setup, posture: &Posture) -> Self {
+        let still = RigidTransform::identity();
+        let mut q = posture.q.clone();
+        offset_joints(setup, &mut q);
+        Self { base_pose_w: still, q, stance_frame_w: still }
+    }
+}
+
+/// Adds the scenario's offsets of joints.
+fn offset_joints(setup: &Setup, q: &mut [f64]) {
+    for (name, offset) in &setup.scenario.robot.start.joint_offset {
+        if let Some(joint) = setup.robot.joint(name) {
+            q[joint] += offset;
+        }
     }
 }
 

@@ -108,10 +108,6 @@ impl ModelErrors {
         if *self == (Self { friction_scale: friction, ..Self::default() }) {
             return Ok(tree.clone());
         }
-        if !tree.is_floating() {
-            let reason = "mass errors are for floating robots";
-            return Err(ModelError::Unsupported { body: 0, reason }.into());
-        }
         let mut factors = vec![self.mass_scale; tree.body_count()];
         for &(body, factor) in &self.body_mass_scale {
             require(positive(factor), "mass factor of a body", factor, "positive")?;
@@ -129,9 +125,12 @@ impl ModelErrors {
             body.inertia.inertia *= factor * self.inertia_scale;
             body
         });
-        let Some(base) = bodies.next() else { return Err(ModelError::Empty.into()) };
-        let mut builder = TreeBuilder::floating_base(*tree.gravity_w(), base.inertia);
-        builder.set_base_wrenches(base.drag, base.constant_wrench_b);
+        let mut builder = TreeBuilder::fixed_base(*tree.gravity_w());
+        if tree.is_floating() {
+            let Some(base) = bodies.next() else { return Err(ModelError::Empty.into()) };
+            builder = TreeBuilder::floating_base(*tree.gravity_w(), base.inertia);
+            builder.set_base_wrenches(base.drag, base.constant_wrench_b);
+        }
         for body in bodies {
             builder.add(body);
         }

@@ -14,9 +14,10 @@
 use delmpc_mechanics::kinematics::{Configuration, Kinematics};
 use delmpc_mechanics::prelude::RigidTransform;
 use delmpc_robots::{JointLimits, RobotModel};
-use nalgebra::{DMatrix, DVector, Matrix3, Vector2, Vector3};
+use nalgebra::{DVector, Matrix3, Vector2, Vector3};
 
 use crate::init::feet::centroid;
+use crate::init::gauss_newton::least_squares;
 
 /// Of the last solution; the first one looks at the mass centre less, so that it comes near from far away.
 const COM: f64 = 300.0;
@@ -26,9 +27,10 @@ const HEIGHT: f64 = 20.0;
 const SWING: f64 = 100.0;
 const SWING_TURN: f64 = 30.0;
 const STAY: f64 = 0.3;
-/// Part of a joint's range that a leg, and another joint, keeps from the stops.
-const LEG_MARGIN: f64 = 0.05;
-const OTHER_MARGIN: f64 = 0.25;
+/// Part of a joint's range that one of a leg keeps from the stops.
+pub const LEG_MARGIN: f64 = 0.05;
+/// The same of another joint.
+pub const OTHER_MARGIN: f64 = 0.25;
 /// Height of the root link over the soles, as a part of that with all joints at zero.
 const BENT: f64 = 0.95;
 /// A joint of a leg that goes less than this beyond 0 to one side is a knee, and where it would rather be, rad.
@@ -36,11 +38,6 @@ const ONE_SIDED: f64 = 0.2;
 const KNEE: f64 = 0.6;
 /// How high the other foot hangs, as a part of that height.
 const LIFT: f64 = 0.06;
-/// Longest step of a joint, rad.
-const STEP: f64 = 0.3;
-/// Levenberg's.
-const DAMPING: f64 = 1e-3;
-const MOST_STEPS: usize = 300;
 /// Mass centre this near to where it should be, m, is good enough.
 const GOOD_M: f64 = 0.005;
 
@@ -86,9 +83,9 @@ pub fn stand_on(robot: &RobotModel, sole: &str) -> Result<Standing, String> {
     };
     let rooted = robot.rooted_at(&stance.frame).map_err(|error| error.rule().to_string())?;
     let mut problem = Problem::new(robot, &rooted.model, sole)?;
-    let near = problem.solve(problem.rather.clone());
+    let near = problem.solve(&problem.rather.clone());
     problem.com_weight = COM;
-    let q = problem.solve(near);
+    let q = problem.solve(&near);
     let (com, base_link) = problem.stands(&q);
     let off = (com.xy() - problem.middle).norm();
     if off > GOOD_M {
@@ -123,7 +120,7 @@ pub fn leg_joints(robot: &RobotModel) -> Vec<String> {
 }
 
 /// A joint's range with a margin at both ends; joints without stops have three radians to either side.
-fn kept(limits: &JointLimits, margin: f64) -> (f64, f64) {
+pub fn kept(limits: &JointLimits, margin: f64) -> (f64, f64) {
     let (lower, upper) = (limits.lower.max(-3.0), limits.upper.min(3.0));
     // Stops that are far away on one side only.
     let (lower, upper) = (lower.min(upper), upper.max(lower));
@@ -204,46 +201,13 @@ impl<'a> Problem<'a> {
         DVector::from_vec(values)
     }
 
-    /// Gauss-Newton with steps of bounded length, in the ranges: joints that would leave them are held for the step.
-    fn solve(&mut self, mut q: DVector<f64>) -> DVector<f64> {
-        let joints = q.len();
-        for _ in 0..MOST_STEPS {
-            let residual = self.residual(&q);
-            let mut jacobian = DMatrix::zeros(residual.len(), joints);
-            const H: f64 = 1e-6;
-            for joint in 0..joints {
-                let mut moved = q.clone();
-                moved[joint] += H;
-                jacobian.set_column(joint, &((self.residual(&moved) - &residual) / H));
-            }
-            let gradient = jacobian.tr_mul(&residual);
-            // A joint at a stop that it would leave its range by stays there.
-            for joint in 0..joints {
-                let held = (q[joint] <= self.lower[joint] && gradient[joint] > 0.0)
-                    || (q[joint] >= self.upper[joint] && gradient[joint] < 0.0);
-                if held {
-                    jacobian.column_mut(joint).fill(0.0);
-                }
-            }
-            let normal = jacobian.tr_mul(&jacobian) + DMatrix::identity(joints, joints) * DAMPING;
-            let Some(factor) = normal.cholesky() else { break };
-            let mut step = -factor.solve(&jacobian.tr_mul(&residual));
-            let longest = step.amax();
-            if longest > STEP {
-                step *= STEP / longest;
-            }
-            let next = (&q + step).sup(&self.lower).inf(&self.upper);
-            let moved = (&next - &q).amax();
-            q = next;
-            if moved < 1e-9 {
-                break;
-            }
-        }
-        q
+    fn solve(&mut self, q: &DVector<f64>) -> DVector<f64> {
+        let (lower, upper) = (self.lower.clone(), self.upper.clone());
+        least_squares(|q| self.residual(q), q, &lower, &upper)
     }
 }
 
 /// Half the skew part of a rotation: small angles about x, y, z.
-fn lean(r: &Matrix3<f64>) -> [f64; 3] {
+pub fn lean(r: &Matrix3<f64>) -> [f64; 3] {
     [(r[(2, 1)] - r[(1, 2)]) / 2.0, (r[(0, 2)] - r[(2, 0)]) / 2.0, (r[(1, 0)] - r[(0, 1)]) / 2.0]
 }

@@ -31,7 +31,8 @@ pub fn all(setup: &Setup, recording: &Recording) -> Result<Vec<(&'static str, Ca
         ("constraints.png", constraints(setup, recording)?),
     ];
     let stance = setup.robot.sole(setup.scenario.robot.stance.first());
-    if let Some(sole) = stance {
+    // A foot that is a point has its pressure point there.
+    if let Some(sole) = stance.filter(|sole| sole.polygon.len() >= 3) {
         let polygon: Vec<[f64; 2]> = sole.polygon.iter().map(|corner| (*corner).into()).collect();
         list.push(("pressure_x.png", pressure(setup, recording, &polygon, 0)?));
         list.push(("pressure_y.png", pressure(setup, recording, &polygon, 1)?));

@@ -20,13 +20,15 @@ pub enum LqError {
     },
     /// The infinite-horizon problem has no stabilising solution.
     #[error(
-        "the terminal Riccati equation did not converge in {iterations} doublings (last change {change:e}): posture or weights leave a mode without control"
+        "the terminal Riccati equation did not converge in {iterations} doublings (last change {change:e}, most of it in state {state}): posture or weights leave a mode without control"
     )]
     NoStabilisingSolution {
         /// Doublings made.
         iterations: usize,
         /// Relative change in the last one.
         change: f64,
+        /// The state whose cost changed most.
+        state: usize,
     },
 }
 

@@ -153,6 +153,44 @@ fn doubling_solves_the_infinite_horizon_equation() {
     }
 }
 
+/// States and inputs in units six decades apart: efforts of exporters, very light links. The gain is the same one in those units.
+#[test]
+fn the_infinite_horizon_does_not_depend_on_units() {
+    let mut plain = problem(7, SIZE, Limits::NONE);
+    plain.stages[0].cost.squares.clear();
+    let expected = solve_dare(&plain.stages[0]).unwrap();
+    let unit = |index: usize| 10_f64.powi((index * 5 % 7) as i32 - 3);
+    let mut other = plain.clone();
+    let stage = &mut other.stages[0];
+    for row in 0..SIZE.states {
+        for column in 0..SIZE.states {
+            stage.a_mut()[(row, column)] *= unit(column) / unit(row);
+        }
+        for input in 0..SIZE.inputs {
+            stage.b_mut()[(row, input)] *= unit(input + 2) / unit(row);
+        }
+    }
+    for input in 0..SIZE.inputs {
+        stage.cost.input_weight[input] *= unit(input + 2).powi(2);
+    }
+    for state in 0..SIZE.states {
+        stage.cost.state_weight[state] *= unit(state).powi(2);
+    }
+    for residual in 0..stage.cost.residuals.len() {
+        let row = stage.cost.residuals.row_mut(residual);
+        row.iter_mut().enumerate().for_each(|(state, value)| *value *= unit(state));
+    }
+    let found = solve_dare(stage).unwrap();
+    for input in 0..SIZE.inputs {
+        let scale = (0..SIZE.states).map(|j| expected.gain[(input, j)].abs()).fold(0.0, f64::max);
+        for state in 0..SIZE.states {
+            let gain = found.gain[(input, state)] * unit(input + 2) / unit(state);
+            let difference = (gain - expected.gain[(input, state)]).abs() / scale;
+            assert!(difference < 1e-7, "{input} {state}: {difference:e}");
+        }
+    }
+}
+
 #[test]
 fn a_mode_without_control_has_no_infinite_horizon_cost() {
     let mut one = problem(7, SIZE, Limits::NONE);

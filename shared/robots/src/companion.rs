@@ -46,6 +46,7 @@ use std::path::{Path, PathBuf};
 
 use delmpc_mechanics::spatial::RigidTransform;
 use nalgebra::{Vector2, Vector3};
+use schemars::JsonSchema;
 use serde::Deserialize;
 use toml::Spanned;
 
@@ -54,75 +55,123 @@ use crate::error::{RobotError, Rule, Subject, shorten};
 use crate::model::{Attachment, ContactPoint, JointLimits, NamedFrame, Posture, RobotModel, Sole};
 use crate::urdf::Description;
 
-#[derive(Deserialize)]
+/// The companion table of a robot: what its URDF cannot say.
+#[derive(Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 struct Tables {
+    /// Version of the table: 1.
+    #[schemars(with = "u32")]
     format: Spanned<u32>,
+    /// Joints without a motor.
     #[serde(default)]
+    #[schemars(with = "Vec<String>")]
     passive: Vec<Spanned<String>>,
+    /// Folder that names of mesh files are relative to, from the table's; that of the table when not given.
+    #[schemars(with = "Option<String>")]
     mesh_folder: Option<PathBuf>,
+    /// Whether inertias that no body has are taken as they are, and joints that carry no mass are held.
     #[serde(default)]
     accept_impossible_inertia: bool,
+    /// Joints that do not move, by name, and where they stand, rad or m.
     #[serde(default)]
+    #[schemars(with = "BTreeMap<String, f64>")]
     locked: BTreeMap<Spanned<String>, f64>,
+    /// Points that may touch the ground.
     #[serde(default)]
+    #[schemars(with = "Vec<ContactTable>")]
     contact: Vec<Spanned<ContactTable>>,
+    /// Named frames.
     #[serde(default)]
+    #[schemars(with = "Vec<FrameTable>")]
     frame: Vec<Spanned<FrameTable>>,
+    /// Feet.
     #[serde(default)]
+    #[schemars(with = "Vec<SoleTable>")]
     sole: Vec<Spanned<SoleTable>>,
+    /// Springs on joints.
     #[serde(default)]
+    #[schemars(with = "Vec<SpringTable>")]
     spring: Vec<Spanned<SpringTable>>,
+    /// Postures.
     #[serde(default)]
+    #[schemars(with = "Vec<PostureTable>")]
     posture: Vec<Spanned<PostureTable>>,
 }
 
-#[derive(Deserialize)]
+/// A point that may touch the ground.
+#[derive(Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 struct ContactTable {
+    /// Name of the point.
     name: String,
+    /// Link it is on.
     link: String,
+    /// Where, in the axes of the link, m.
     position_m: [f64; 3],
+    /// Radius of the sphere around it, m; 0: a point.
     #[serde(default)]
     radius_m: f64,
 }
 
-#[derive(Deserialize)]
+/// A named frame.
+#[derive(Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 struct FrameTable {
+    /// Name of the frame.
     name: String,
+    /// Link it is on.
     link: String,
+    /// Its origin in the axes of the link, m.
     position_m: [f64; 3],
+    /// Its axes: roll, pitch, yaw, rad. z of a sole points out of the ground, x forward.
     #[serde(default)]
     rpy_rad: [f64; 3],
 }
 
-#[derive(Deserialize)]
+/// A foot.
+#[derive(Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 struct SoleTable {
+    /// Name of the foot.
     name: String,
+    /// Frame in whose x, y plane it is.
     frame: String,
+    /// Contacts that are its corners, counter-clockwise from above; one: a foot that is a point or a sphere.
     corners: Vec<String>,
 }
 
-#[derive(Deserialize)]
+/// A spring on a joint.
+#[derive(Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 struct SpringTable {
+    /// The joint.
     joint: String,
+    /// Its stiffness, N m/rad; of a sliding joint `stiffness_n_per_m`.
     #[serde(alias = "stiffness_n_per_m")]
     stiffness_nm_per_rad: f64,
+    /// Where it is relaxed, rad; of a sliding joint `rest_m`.
     #[serde(default, alias = "rest_m")]
     rest_rad: f64,
 }
 
-#[derive(Deserialize)]
+/// A posture.
+#[derive(Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 struct PostureTable {
+    /// Name of the posture.
     name: String,
+    /// The root link's origin in the world, m; a scenario needs it.
     base_position_m: Option<[f64; 3]>,
+    /// Its axes there: roll, pitch, yaw, rad.
     base_rpy_rad: Option<[f64; 3]>,
+    /// Joints by name, rad or m; those that are not named are at 0.
     #[serde(default)]
     joints: BTreeMap<String, f64>,
+}
+
+/// The JSON schema of companion tables, for editors and for the list of keys.
+pub fn companion_schema() -> schemars::Schema {
+    schemars::schema_for!(Tables)
 }
 
 /// A parsed companion file, not yet compared with the robot.

@@ -48,6 +48,7 @@ mod model;
 mod rooted;
 mod urdf;
 
+pub use companion::companion_schema;
 pub use error::{RobotError, Rule, Subject};
 pub use load::{BaseChoice, Companion, ImpossibleInertia, LoadOptions, load, load_str, load_with};
 pub use mimic::CoordinateMap;

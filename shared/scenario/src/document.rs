@@ -442,6 +442,7 @@ fn words(key: &str) -> Option<&'static [&'static str]> {
         "fault.target" => Some(&["state", "command", "plant", "controller", "machine"]),
         "gait.kind" => Some(&GAIT_KINDS),
         "clock" => Some(&["realtime", "lockstep"]),
+        "robot.base" => Some(&["floating", "fixed"]),
         "controller.kind" => Some(&["mpc", "static-lqr", "off"]),
         _ => None,
     }

@@ -1,9 +1,10 @@
 //! Faults that are injected on purpose.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// What goes wrong.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum FaultKind {
     /// Messages do not arrive. Commands lost in a row are control cycles dropped.
@@ -73,7 +74,7 @@ impl FaultKind {
 }
 
 /// What a fault happens to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum FaultTarget {
     /// States on their way to the controller.
@@ -102,7 +103,7 @@ impl FaultTarget {
 }
 
 /// A fault: in every run those of messages, in `delmpc timing --faults` each in a run of its own.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct FaultSettings {
     /// What goes wrong.

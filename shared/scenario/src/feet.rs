@@ -2,10 +2,11 @@
 
 use std::fmt;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The soles a robot stands on at the start.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged)]
 pub enum Stance {
     /// One, or `all` that the robot has.
@@ -55,8 +56,8 @@ impl fmt::Display for Stance {
     }
 }
 
-/// Going on four feet.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// Going on two or four feet.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct GaitSettings {
     /// Which feet go together.
@@ -67,7 +68,7 @@ pub struct GaitSettings {
     pub side_speed_m_s: f64,
     /// Turning to the left, rad/s.
     pub yaw_rate_rad_s: f64,
-    /// Time from one lift-off of a foot to the next, s.
+    /// Time from one lift-off of a foot to the next, s; 0: by the robot's size.
     pub period_s: f64,
     /// Part of it on the ground.
     pub duty: f64,
@@ -80,7 +81,7 @@ pub struct GaitSettings {
 }
 
 /// Which feet go together.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum GaitKind {
     /// Diagonal pairs.
@@ -107,7 +108,7 @@ impl Default for GaitSettings {
             speed_m_s: 0.0,
             side_speed_m_s: 0.0,
             yaw_rate_rad_s: 0.0,
-            period_s: 0.6,
+            period_s: 0.0,
             duty: 0.6,
             start_s: 0.5,
             stop_s: 1e6,
@@ -117,7 +118,7 @@ impl Default for GaitSettings {
 }
 
 /// A step of one foot.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct StepSettings {
     /// The sole that steps.
@@ -140,7 +141,7 @@ impl Default for StepSettings {
 
 /// What the controller of a robot on several feet, or on its way, trades against each other: one over the square of the deviation that
 /// counts 1. Forces count relative to the robot's weight.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LeggedSettings {
     /// Rotation of the base, 1/rad².
@@ -216,7 +217,7 @@ impl GaitSettings {
             ("gait.speed_m_s", self.speed_m_s, -10.0, 10.0),
             ("gait.side_speed_m_s", self.side_speed_m_s, -10.0, 10.0),
             ("gait.yaw_rate_rad_s", self.yaw_rate_rad_s, -10.0, 10.0),
-            ("gait.period_s", self.period_s, 0.05, 10.0),
+            ("gait.period_s", self.period_s, if self.period_s == 0.0 { 0.0 } else { 0.05 }, 10.0),
             ("gait.duty", self.duty, 0.05, 0.98),
             ("gait.start_s", self.start_s, 0.0, 3600.0),
             ("gait.stop_s", self.stop_s, self.start_s, f64::MAX),

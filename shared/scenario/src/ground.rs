@@ -2,14 +2,17 @@
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The robot and how it stands at the beginning.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RobotSettings {
     /// URDF file, relative to the scenario file; its companion table lies beside it.
     pub urdf: String,
+    /// Whether its root link floats, or is bolted to the world: then nothing is asked of soles.
+    pub base: Base,
     /// Soles it stands on, by their names in the companion table: one, a list, or "all".
     pub stance: crate::Stance,
     /// Posture it begins and rests in, by its name in the companion table.
@@ -20,9 +23,20 @@ pub struct RobotSettings {
     pub start: StartSettings,
 }
 
+/// What the root link does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Base {
+    /// It floats.
+    #[default]
+    Floating,
+    /// It is bolted to the world: its frame is the world's and the stance frame.
+    Fixed,
+}
+
 /// How the start differs from the posture on its ground: the whole robot moved, and turned about the origin of its stance sole. A robot
 /// that starts like that has half a second to land before tilt and pressure point of its foot are judged.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, Default)]
 #[serde(deny_unknown_fields, default)]
 pub struct StartSettings {
     /// Above the ground, along its normal, m.
@@ -41,14 +55,16 @@ pub struct StartSettings {
 }
 
 /// Boxes on the ground and gaps in it, in the axes of the ground: x, y along it, z up from it, its origin where the world's is.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, Default)]
 #[serde(deny_unknown_fields, default)]
 pub struct TerrainSettings {
     /// Boxes: a list `[[terrain.box]]`.
     #[serde(rename = "box", with = "crate::list", skip_serializing_if = "Vec::is_empty")]
+    #[schemars(with = "crate::list::OneOrMany<BoxSettings>")]
     pub boxes: Vec<BoxSettings>,
     /// Gaps: a list `[[terrain.gap]]`.
     #[serde(rename = "gap", with = "crate::list", skip_serializing_if = "Vec::is_empty")]
+    #[schemars(with = "crate::list::OneOrMany<GapSettings>")]
     pub gaps: Vec<GapSettings>,
 }
 
@@ -60,7 +76,7 @@ impl TerrainSettings {
 }
 
 /// A box on the ground.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BoxSettings {
     /// Its centre, m.
@@ -72,7 +88,7 @@ pub struct BoxSettings {
 }
 
 /// A rectangle without ground.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct GapSettings {
     /// Smallest x and y, m.

@@ -40,7 +40,7 @@ pub use document::Document;
 pub use error::{Place, ScenarioError};
 pub use fault::{FaultKind, FaultSettings, FaultTarget};
 pub use feet::{GaitKind, GaitSettings, LeggedSettings, Stance, StepSettings};
-pub use ground::{BoxSettings, GapSettings, RobotSettings, StartSettings, TerrainSettings};
+pub use ground::{Base, BoxSettings, GapSettings, RobotSettings, StartSettings, TerrainSettings};
 pub use plan::{PlanBound, PlanGap, PlanObstacle, PlanSettings, PlanSpring, PlanStep, PlanWeightSettings};
 pub use scenario::{
     Clock, ConstraintSettings, ControllerKind, ControllerSettings, PlantSettings, ProcessSettings,

@@ -1,11 +1,16 @@
 //! A key that holds one table or a list of tables.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-#[derive(Deserialize)]
+/// One table, or a list of them.
+#[derive(Deserialize, JsonSchema)]
 #[serde(untagged)]
-enum OneOrMany<T> {
+#[schemars(inline)]
+pub(crate) enum OneOrMany<T> {
+    /// `[[key]]`
     Many(Vec<T>),
+    /// `[key]`
     One(T),
 }
 

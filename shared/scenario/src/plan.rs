@@ -1,9 +1,10 @@
 //! The keys of `[plan]`: a motion to be planned through contact, `delmpc plan`.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// A motion to be planned. The robot and its start posture are those of `[robot]`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PlanSettings {
     /// Plan that a run follows, relative to the scenario file; empty: none.
@@ -60,25 +61,30 @@ pub struct PlanSettings {
     pub yaw_arm_m: f64,
     /// Obstacles, cleared and never stood on: a table `[plan.obstacle]` or a list.
     #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
+    #[schemars(with = "crate::list::OneOrMany<PlanObstacle>")]
     pub obstacle: Vec<PlanObstacle>,
     /// Gaps, across the whole way: a table `[plan.gap]` or a list.
     #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
+    #[schemars(with = "crate::list::OneOrMany<PlanGap>")]
     pub gap: Vec<PlanGap>,
     /// Steps, across the whole way: a table `[plan.step]` or a list.
     #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
+    #[schemars(with = "crate::list::OneOrMany<PlanStep>")]
     pub step: Vec<PlanStep>,
     /// Springs in joints, instead of the robot's: a table `[plan.spring]` or a list.
     #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
+    #[schemars(with = "crate::list::OneOrMany<PlanSpring>")]
     pub spring: Vec<PlanSpring>,
     /// Bounds of coordinates, beside the robot's: a table `[plan.bound]` or a list.
     #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
+    #[schemars(with = "crate::list::OneOrMany<PlanBound>")]
     pub bound: Vec<PlanBound>,
     /// What the plan trades against each other.
     pub weights: PlanWeightSettings,
 }
 
 /// A box to clear.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PlanObstacle {
     /// Where its middle is along x, m.
@@ -90,7 +96,7 @@ pub struct PlanObstacle {
 }
 
 /// A stretch without ground.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PlanGap {
     /// Where it begins along x, m.
@@ -100,7 +106,7 @@ pub struct PlanGap {
 }
 
 /// A change of the ground's height.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PlanStep {
     /// Where it is along x, m.
@@ -110,7 +116,7 @@ pub struct PlanStep {
 }
 
 /// A spring in a joint.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PlanSpring {
     /// Joint.
@@ -122,7 +128,7 @@ pub struct PlanSpring {
 }
 
 /// Bounds of a coordinate.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PlanBound {
     /// Coordinate: a joint, or `base_x` and so on.
@@ -134,7 +140,7 @@ pub struct PlanBound {
 }
 
 /// Weights of a plan: one over the square of the deviation that counts 1, integrated over time where it is a rate of cost.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PlanWeightSettings {
     /// Torque that counts 1 per second, N m.

@@ -1,5 +1,6 @@
 //! The keys of a scenario. Field names are the key names.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::{
@@ -8,7 +9,7 @@ use crate::{
 };
 
 /// Everything that decides a run.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Scenario {
     /// Name in figures and folders; the file's name when not given.
@@ -37,15 +38,18 @@ pub struct Scenario {
     pub reach: Option<ReachSettings>,
     /// Pushes: one table `[push]` or a list `[[push]]`.
     #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
+    #[schemars(with = "crate::list::OneOrMany<PushSettings>")]
     pub push: Vec<PushSettings>,
     /// Faults on purpose: one table `[fault]` or a list `[[fault]]`.
     #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
+    #[schemars(with = "crate::list::OneOrMany<FaultSettings>")]
     pub fault: Vec<FaultSettings>,
     /// A gait on four feet.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gait: Option<GaitSettings>,
     /// Single steps: a list `[[step]]`.
     #[serde(with = "crate::list", skip_serializing_if = "Vec::is_empty")]
+    #[schemars(with = "crate::list::OneOrMany<StepSettings>")]
     pub step: Vec<StepSettings>,
     /// A motion to be planned through contact.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -57,7 +61,7 @@ pub struct Scenario {
 }
 
 /// Which clock a run follows.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Clock {
     /// The wall clock; a late command is a late command.
@@ -67,7 +71,7 @@ pub enum Clock {
 }
 
 /// The simulation.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PlantSettings {
     /// Time step, s.
@@ -93,7 +97,7 @@ pub struct PlantSettings {
 }
 
 /// The sensors. Their noise is given at `noise_scale = 1`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SensorSettings {
     /// Multiplies all noise and bias; 0 switches these and the resolutions off.
@@ -155,7 +159,7 @@ pub struct SensorSettings {
 }
 
 /// What computes the torques.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum ControllerKind {
     /// Model-predictive control.
@@ -167,7 +171,7 @@ pub enum ControllerKind {
 }
 
 /// The controller.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ControllerSettings {
     /// What computes the torques.
@@ -195,7 +199,7 @@ pub struct ControllerSettings {
 }
 
 /// Weights of the controller's tasks: one over the square of the deviation that counts 1. 0 switches a task off.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct WeightSettings {
     /// Every joint away from its reference, 1/rad².
@@ -221,7 +225,7 @@ pub struct WeightSettings {
 }
 
 /// Constraints of the controller. Joint limits come from the robot.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ConstraintSettings {
     /// Part of the torque limits the plan may use.
@@ -235,7 +239,7 @@ pub struct ConstraintSettings {
 }
 
 /// What is asked of the operating system. What it refuses is a warning, not an error.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ProcessSettings {
     /// Real-time priority (SCHED_FIFO) of the controller, 1 to 99; the plant, whose period is shorter, has one more. 0: ordinary
@@ -256,7 +260,7 @@ pub struct ProcessSettings {
 }
 
 /// A ball to fetch with a hand.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReachSettings {
     /// Frame of the robot that must reach the ball.
@@ -274,7 +278,7 @@ pub struct ReachSettings {
 }
 
 /// A push: a constant force on the mass centre of a link.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PushSettings {
     /// Link that is pushed.
@@ -290,7 +294,7 @@ pub struct PushSettings {
 }
 
 /// What counts as success. A criterion about something that does not happen in the run is fulfilled.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SuccessSettings {
     /// The robot must not fall.

@@ -1,10 +1,11 @@
 //! The keys of `delmpc timing`.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Thresholds of `delmpc timing`. Those named `…_of_floor` are relative to what the machine itself does in the same minutes; absolute ones
 /// hold when given.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TimingSettings {
     /// Time without the core from which on the machine is said to have interfered, s.
