@@ -241,7 +241,8 @@ fn point(robot: &RobotModel, frame: &str) -> Option<BodyPoint> {
     Some(BodyPoint { body: frame.body?, position: frame.pose.translation })
 }
 
-fn config(scenario: &Scenario) -> ControllerConfig {
+/// What is chosen for the controller of a robot on one foot.
+pub fn config(scenario: &Scenario) -> ControllerConfig {
     let settings = &scenario.controller;
     let period_s = 1.0 / settings.mpc_rate_hz;
     let weights = &settings.weights;

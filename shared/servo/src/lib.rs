@@ -1,7 +1,7 @@
 //! What a motor board links: the law between two commands, the queue of commands, the watchdog for when none comes.
 //!
 //! `no_std`, allocation in constructors only. It knows messages, and neither robot nor solver: the plant of the simulation, a firmware
-//! and another simulator use the same one. Start at [`servo::Servo`].
+//! and another simulator use the same one. Start at [`servo::Servo`]; [`wire`] has frames for a board that is reached over a line.
 //!
 //! ```
 //! use delmpc_messages::{Command, ServoReadings};
@@ -25,6 +25,7 @@ extern crate std;
 
 pub mod error;
 pub mod servo;
+pub mod wire;
 
 /// What most users need.
 pub mod prelude {
