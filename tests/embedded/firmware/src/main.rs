@@ -38,10 +38,13 @@ const LOOK_EVERY: u32 = 500;
 
 #[entry]
 fn main() -> ! {
+    // SAFETY: the first thing that happens, once.
+    unsafe { HEAP.start() };
     stack::paint();
     let Some(mut task) = task() else { stop("the robot's constants were refused") };
     HEAP.seal();
-    hprintln!("ready: {} bytes of heap, {} of stack in the constructors", HEAP.used(), stack::deepest());
+    hprintln!("ready: {} bytes of heap, {} of stack in the constructors", HEAP.needed(), stack::deepest());
+    stack::paint();
     // SAFETY: once, on the machine this is built for.
     run(&mut task, unsafe { Uart::start() })
 }
@@ -57,7 +60,7 @@ fn run(task: &mut ControlTask, mut line: Uart) -> ! {
     let joints = robot::ROBOT.joints();
     let mut readings = PlantState::new(0, robot::ROBOT.joint_set_hash, joints as u32);
     let (mut receiver, mut frame) = (Receiver::new(), [0; FRAME_CAPACITY]);
-    let mut figures = BoardFigures { heap_bytes: HEAP.used() as u32, ..BoardFigures::default() };
+    let mut figures = BoardFigures { heap_bytes: HEAP.needed() as u32, ..BoardFigures::default() };
     let mut ticks = 0_u32;
     loop {
         let Some((FrameKind::Readings, payload)) = receiver.take(line.read()) else { continue };

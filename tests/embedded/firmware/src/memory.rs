@@ -1,73 +1,65 @@
-//! The heap of the constructors: memory handed out from the front of an arena, none taken back, none after the start.
+//! The heap of the constructors: none is used after the start.
 //!
 //! A microcontroller that allocates while it controls will one day find no block large enough. So the heap is sealed when the constructors
-//! are done: a request after that is counted and refused, and the firmware stops its motors instead.
+//! are done: a request after that is counted and refused.
 
 use core::alloc::{GlobalAlloc, Layout};
-use core::cell::UnsafeCell;
-use core::ptr::null_mut;
+use core::mem::MaybeUninit;
+use core::ptr::{addr_of_mut, null_mut};
 use core::sync::atomic::{AtomicBool, AtomicU32, AtomicUsize, Ordering};
 
-/// Bytes of the arena.
-pub const ARENA: usize = 3 << 20;
-const ALIGNMENT: usize = 64;
+use embedded_alloc::LlffHeap;
 
-#[repr(align(64))]
-struct Arena(UnsafeCell<[u8; ARENA]>);
+/// Bytes of the heap.
+pub const ARENA: usize = 2 << 20;
 
-/// The allocator.
+static mut MEMORY: [MaybeUninit<u8>; ARENA] = [MaybeUninit::uninit(); ARENA];
+
+/// A first-fit heap that can be sealed.
 pub struct ConstructorsOnly {
-    arena: Arena,
-    used: AtomicUsize,
+    heap: LlffHeap,
     sealed: AtomicBool,
     late: AtomicU32,
+    highest: AtomicUsize,
 }
 
-// SAFETY: every byte of the arena is handed out at most once, because `used` only grows, atomically.
-unsafe impl Sync for ConstructorsOnly {}
-
-// SAFETY: blocks lie inside the arena, are aligned as asked (the arena is aligned to 64 bytes, more is refused) and disjoint, but for a
-// last block that is given back or grows in place.
+// SAFETY: the heap's promises are kept by the heap; sealed, no block is handed out at all.
 unsafe impl GlobalAlloc for ConstructorsOnly {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         if self.sealed.load(Ordering::Relaxed) {
             self.late.fetch_add(1, Ordering::Relaxed);
             return null_mut();
         }
-        if layout.align() > ALIGNMENT {
-            return null_mut();
-        }
-        let mut used = self.used.load(Ordering::Relaxed);
-        loop {
-            let start = used.next_multiple_of(layout.align());
-            let Some(end) = start.checked_add(layout.size()).filter(|end| *end <= ARENA) else {
-                return null_mut();
-            };
-            match self.used.compare_exchange_weak(used, end, Ordering::Relaxed, Ordering::Relaxed) {
-                // SAFETY: `start` is inside the arena.
-                Ok(_) => return unsafe { self.arena.0.get().cast::<u8>().add(start) },
-                Err(now) => used = now,
-            }
-        }
+        // SAFETY: the caller's layout is passed on.
+        let block = unsafe { self.heap.alloc(layout) };
+        self.highest.fetch_max(block as usize + layout.size(), Ordering::Relaxed);
+        block
     }
 
     unsafe fn dealloc(&self, block: *mut u8, layout: Layout) {
-        // The last block can be taken back: vectors that live for a line of a constructor cost nothing.
-        let start = block as usize - self.arena.0.get() as usize;
-        let end = start + layout.size();
-        let _ = self.used.compare_exchange(end, start, Ordering::Relaxed, Ordering::Relaxed);
+        // SAFETY: the block came from the same heap.
+        unsafe { self.heap.dealloc(block, layout) }
     }
 }
 
 impl ConstructorsOnly {
-    /// An empty heap.
+    /// Without memory yet.
     pub const fn new() -> Self {
         Self {
-            arena: Arena(UnsafeCell::new([0; ARENA])),
-            used: AtomicUsize::new(0),
+            heap: LlffHeap::empty(),
             sealed: AtomicBool::new(false),
             late: AtomicU32::new(0),
+            highest: AtomicUsize::new(0),
         }
+    }
+
+    /// Gives it its memory.
+    ///
+    /// # Safety
+    /// Once, before anything is allocated.
+    pub unsafe fn start(&self) {
+        // SAFETY: nobody else uses this memory, by the caller's promise.
+        unsafe { self.heap.init(addr_of_mut!(MEMORY) as usize, ARENA) }
     }
 
     /// From here on every request is refused and counted.
@@ -75,9 +67,14 @@ impl ConstructorsOnly {
         self.sealed.store(true, Ordering::Relaxed);
     }
 
-    /// Bytes handed out.
+    /// Bytes in use.
     pub fn used(&self) -> usize {
-        self.used.load(Ordering::Relaxed)
+        self.heap.used()
+    }
+
+    /// Bytes a heap must have for what was asked of it so far: up to the end of the highest block.
+    pub fn needed(&self) -> usize {
+        self.highest.load(Ordering::Relaxed).saturating_sub(addr_of_mut!(MEMORY) as usize)
     }
 
     /// Requests after the seal.

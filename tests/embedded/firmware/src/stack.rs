@@ -13,8 +13,7 @@ unsafe extern "C" {
 
 /// Lowest address the stack may reach, and the one above its first entry.
 fn bounds() -> (usize, usize) {
-    // SAFETY: only the addresses of the linker's symbols are taken.
-    unsafe { (addr_of!(__sheap) as usize, addr_of!(_stack_start) as usize) }
+    (addr_of!(__sheap) as usize, addr_of!(_stack_start) as usize)
 }
 
 /// Paints what is below the stack pointer.
