@@ -27,7 +27,7 @@ use delmpc_servo::wire::{
 use serde::Serialize;
 
 use crate::board_robot::BoardRobot;
-use crate::output::say;
+use crate::output::{printable, say};
 use crate::part::leave_part;
 use crate::setup::Setup;
 use crate::verdict::{Ended, Failure};
@@ -38,6 +38,8 @@ const PATIENCE: Duration = Duration::from_secs(60);
 const LIFE_STEPS: f64 = 4.0;
 /// Largest difference between an answer of the board and the library's, relative where the number is larger than 1.
 pub const LARGEST_DIFFERENCE: f64 = 1e-9;
+/// Most characters kept of what a board says.
+const MOST_SAID: usize = 4000;
 /// What is left in the run's folder.
 pub const BOARD_PART: &str = "board.json";
 
@@ -77,6 +79,8 @@ pub struct BoardController {
     twin: ControlTask,
     life_ns: u64,
     summary: BoardSummary,
+    /// What it says beside its frames: words, at the start and when it stops.
+    said: String,
     /// What broke, first.
     broken: Option<String>,
 }
@@ -108,6 +112,7 @@ impl BoardController {
             twin,
             life_ns: (LIFE_STEPS * scenario.plant.step_s * 1e9).round() as u64,
             summary: BoardSummary::default(),
+            said: String::new(),
             broken: None,
         })
     }
@@ -122,7 +127,7 @@ impl BoardController {
             let wanted = self.receiver.missing().min(bytes.len());
             let count = self.line.read(&mut bytes[..wanted]).map_err(in_words)?;
             if count == 0 {
-                return Err("the board hung up".to_owned());
+                return Err(format!("the board hung up; it said: {}", printable(&self.said)));
             }
             for byte in &bytes[..count] {
                 if let Some((FrameKind::Answer, payload)) = self.receiver.take(*byte) {
@@ -130,6 +135,8 @@ impl BoardController {
                     if answer.sequence == state.header.sequence {
                         return Ok(answer);
                     }
+                } else if self.receiver.is_idle() && self.said.len() < MOST_SAID {
+                    self.said.push(char::from(*byte));
                 }
             }
         }

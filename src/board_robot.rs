@@ -143,7 +143,7 @@ impl BoardRobot {
              //! SI units; joints and bodies in the order of the messages, body 0 is the floating base.",
             self.name
         ));
-        put("#![allow(clippy::all)]\n#![cfg_attr(rustfmt, rustfmt_skip)]\n");
+        put("#![allow(clippy::all, dead_code, unused_imports)]\n#![cfg_attr(rustfmt, rustfmt_skip)]\n");
         put(
             "use delmpc_controller_core::config::{ConstraintConfig, ControllerConfig, ControllerKind, StageBlock};",
         );

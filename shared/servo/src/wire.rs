@@ -307,6 +307,11 @@ impl Receiver {
         self.length().unwrap_or(HEAD).saturating_sub(self.used).max(1)
     }
 
+    /// Whether the last byte was part of no frame, or the end of one.
+    pub fn is_idle(&self) -> bool {
+        self.used == 0
+    }
+
     fn length(&self) -> Option<usize> {
         (self.used >= HEAD)
             .then(|| HEAD + usize::from(u16::from_le_bytes([self.frame[4], self.frame[5]])) + TAIL)

@@ -11,10 +11,10 @@
 
 extern crate alloc;
 
+mod line;
 mod memory;
 mod robot;
 mod stack;
-mod uart;
 
 use core::panic::PanicInfo;
 
@@ -27,8 +27,8 @@ use delmpc_servo::wire::{
     BoardFigures, FRAME_CAPACITY, FrameKind, Receiver, read_readings, write_answer,
 };
 
+use line::Line;
 use memory::ConstructorsOnly;
-use uart::Uart;
 
 #[global_allocator]
 static HEAP: ConstructorsOnly = ConstructorsOnly::new();
@@ -45,8 +45,8 @@ fn main() -> ! {
     HEAP.seal();
     hprintln!("ready: {} bytes of heap, {} of stack in the constructors", HEAP.needed(), stack::deepest());
     stack::paint();
-    // SAFETY: once, on the machine this is built for.
-    run(&mut task, unsafe { Uart::start() })
+    let Some(line) = Line::open() else { stop("there is no line") };
+    run(&mut task, line)
 }
 
 /// The task of the robot this firmware is for. Not inlined: what its constructors take of the stack is given back.
@@ -56,17 +56,14 @@ fn task() -> Option<ControlTask> {
     ControlTask::with_active_set(model, robot::config(), robot::watchdog()).ok()
 }
 
-fn run(task: &mut ControlTask, mut line: Uart) -> ! {
+fn run(task: &mut ControlTask, mut line: Line) -> ! {
     let joints = robot::ROBOT.joints();
     let mut readings = PlantState::new(0, robot::ROBOT.joint_set_hash, joints as u32);
     let (mut receiver, mut frame) = (Receiver::new(), [0; FRAME_CAPACITY]);
     let mut figures = BoardFigures { heap_bytes: HEAP.needed() as u32, ..BoardFigures::default() };
     let mut ticks = 0_u32;
     loop {
-        let Some((FrameKind::Readings, payload)) = receiver.take(line.read()) else { continue };
-        if read_readings(payload, &mut readings).is_none() {
-            continue;
-        }
+        receive(&mut line, &mut receiver, &mut readings);
         // As if the last readings were repeated, a tick without new ones is the servo's watchdog's business.
         task.tick(&readings, &StoppedClock);
         let command = task.cycled().then(|| task.command());
@@ -86,6 +83,22 @@ fn run(task: &mut ControlTask, mut line: Uart) -> ! {
             stop("an answer does not fit into its frame")
         };
         line.write(&frame[..length]);
+    }
+}
+
+/// Waits for readings: a real board waits for its timer and reads its encoders.
+fn receive(line: &mut Line, receiver: &mut Receiver, readings: &mut PlantState) {
+    let mut bytes = [0; 512];
+    loop {
+        let wanted = receiver.missing().min(bytes.len());
+        let count = line.read(&mut bytes[..wanted]);
+        for byte in &bytes[..count] {
+            if let Some((FrameKind::Readings, payload)) = receiver.take(*byte)
+                && read_readings(payload, readings).is_some()
+            {
+                return;
+            }
+        }
     }
 }
 
