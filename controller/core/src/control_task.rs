@@ -89,25 +89,28 @@ impl ControlTask {
         })
     }
 
-    /// One servo period, with a control cycle when one is due; returns the torque of every joint in the order of the messages. `clock`
+    /// One servo period, then a control cycle when one is due; returns the torque of every joint in the order of the messages. `clock`
     /// times the steps of the cycle for its report. No allocation.
+    ///
+    /// The servo comes first: what its timer waits for is the torque, and the command whose time has come takes effect before the next
+    /// one arrives. So a robot without a command yet is held by the watchdog's law for a servo period.
     pub fn tick(&mut self, readings: &PlantState, clock: &dyn Clock) -> &[f64] {
         let now_ns = readings.time_ns;
-        self.cycled = self.next_cycle_ns.is_none_or(|due_ns| now_ns >= due_ns);
-        if self.cycled {
-            let first = self.next_cycle_ns.is_none();
-            self.next_cycle_ns =
-                Some(self.next_cycle_ns.unwrap_or(now_ns).saturating_add(self.period_ns).max(now_ns));
-            self.cycle(readings, first, clock);
-        }
         let torque = &mut self.torque[..self.joints];
-        // Readings that are damaged lead to no torque at all but what the watchdog gives without them.
         if readings.validate(self.command.header.joint_set_hash, self.joints).is_ok() {
             self.servo.torque_into(now_ns, &ServoReadings::of_state(readings), torque);
         } else {
+            // No law is right for readings that are damaged.
             torque.fill(0.0);
         }
-        torque
+        self.cycled = self.next_cycle_ns.is_none_or(|due_ns| now_ns >= due_ns);
+        if self.cycled {
+            let first = self.next_cycle_ns.is_none();
+            let next_ns = self.next_cycle_ns.unwrap_or(now_ns).saturating_add(self.period_ns);
+            self.next_cycle_ns = Some(next_ns.max(now_ns));
+            self.cycle(readings, first, clock);
+        }
+        &self.torque[..self.joints]
     }
 
     fn cycle(&mut self, readings: &PlantState, first: bool, clock: &dyn Clock) {

@@ -1,7 +1,7 @@
 //! lamp: 6 joints. Written by `delmpc model --emit rust`; change the URDF or the scenario, not this.
 //!
 //! SI units; joints and bodies in the order of the messages, body 0 is the floating base.
-#![allow(clippy::all)]
+#![allow(clippy::all, dead_code, unused_imports)]
 #![cfg_attr(rustfmt, rustfmt_skip)]
 
 use delmpc_controller_core::config::{ConstraintConfig, ControllerConfig, ControllerKind, StageBlock};

@@ -67,11 +67,6 @@ impl ConstructorsOnly {
         self.sealed.store(true, Ordering::Relaxed);
     }
 
-    /// Bytes in use.
-    pub fn used(&self) -> usize {
-        self.heap.used()
-    }
-
     /// Bytes a heap must have for what was asked of it so far: up to the end of the highest block.
     pub fn needed(&self) -> usize {
         self.highest.load(Ordering::Relaxed).saturating_sub(addr_of_mut!(MEMORY) as usize)
