@@ -11,6 +11,7 @@
 
 extern crate alloc;
 
+mod count;
 mod line;
 mod memory;
 mod robot;
@@ -45,6 +46,7 @@ fn main() -> ! {
     HEAP.seal();
     hprintln!("ready: {} bytes of heap, {} of stack in the constructors", HEAP.needed(), stack::deepest());
     stack::paint();
+    count::start();
     let Some(line) = Line::open() else { stop("there is no line") };
     run(&mut task, line)
 }
@@ -64,8 +66,9 @@ fn run(task: &mut ControlTask, mut line: Line) -> ! {
     let mut ticks = 0_u32;
     loop {
         receive(&mut line, &mut receiver, &mut readings);
-        // As if the last readings were repeated, a tick without new ones is the servo's watchdog's business.
+        let begin = count::now();
         task.tick(&readings, &StoppedClock);
+        count::tell(begin, task.cycled());
         let command = task.cycled().then(|| task.command());
         if ticks.is_multiple_of(LOOK_EVERY) {
             figures.stack_bytes = stack::deepest() as u32;
