@@ -95,6 +95,12 @@ fn receive(line: &mut Line, receiver: &mut Receiver, readings: &mut PlantState) 
     loop {
         let wanted = receiver.missing().min(bytes.len());
         let count = line.read(&mut bytes[..wanted]);
+        if count == 0 {
+            // The other end hung up: the run is over.
+            loop {
+                debug::exit(debug::EXIT_SUCCESS);
+            }
+        }
         for byte in &bytes[..count] {
             if let Some((FrameKind::Readings, payload)) = receiver.take(*byte)
                 && read_readings(payload, readings).is_some()
