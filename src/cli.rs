@@ -103,6 +103,11 @@ Examples:
   delmpc plant configs/scenarios/atlas_one_foot.toml --out /tmp/try &
   delmpc controller configs/scenarios/atlas_one_foot.toml --out /tmp/try";
 
+const CONTROLLER_EXAMPLES: &str = "\
+Examples:
+  delmpc controller configs/scenarios/atlas_one_foot.toml --out /tmp/try
+  delmpc controller configs/examples/lamp/board.toml --board 127.0.0.1:5555 --out /tmp/try";
+
 const MODEL_EXAMPLES: &str = "\
 Examples:
   delmpc model configs/robots/atlas.urdf
@@ -182,8 +187,8 @@ pub enum Command {
     ///
     /// Whichever process is started first waits for the other one. Both find each other by the scenario, so give both the same
     /// file and the same --set.
-    #[command(after_long_help = PART_EXAMPLES)]
-    Controller(PartArguments),
+    #[command(after_long_help = CONTROLLER_EXAMPLES)]
+    Controller(ControllerArguments),
     /// Check a robot model; print its table, draw it or, with --at, compute everything from it
     ///
     /// The table shows the tree with joints, limits and masses, the names of the companion table, how the robot stands in each of its
@@ -283,6 +288,21 @@ pub struct RunArguments {
     /// Options.
     #[command(flatten)]
     pub options: RunOptions,
+}
+
+/// Arguments of the controller process alone.
+#[derive(Debug, Clone, Args)]
+pub struct ControllerArguments {
+    /// Arguments of every process.
+    #[command(flatten)]
+    pub part: PartArguments,
+    /// A board computes the commands, reached at this address; every answer is held against this machine's own
+    ///
+    /// The board is sent the readings of every plant step and answers with torques, in lockstep: its frames are in
+    /// shared/servo/src/wire.rs, its firmware is what `delmpc model --emit rust` and tests/embedded are for. Exit status 1 when an
+    /// answer is more than 1e-9 beside what the library gives.
+    #[arg(long, value_name = "HOST:PORT", conflicts_with = "timing")]
+    pub board: Option<String>,
 }
 
 /// Arguments of one process alone.

@@ -7,7 +7,8 @@ use delmpc_messages::{Command, Role, Verdict};
 use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::{Channel, RunId};
 
-use crate::cli::PartArguments;
+use crate::board::BoardController;
+use crate::cli::{ControllerArguments, PartArguments};
 use crate::faults::FaultyController;
 use crate::output::say;
 use crate::part::{
@@ -25,11 +26,16 @@ use crate::verdict::{Ended, Failure};
 ///
 /// # Errors
 /// [`Failure::Input`] before anything runs, [`Failure::Fault`] when the run broke off.
-pub fn controller(arguments: &PartArguments, allocations: fn() -> u64) -> Result<Ended, Failure> {
+pub fn controller(arguments: &ControllerArguments, allocations: fn() -> u64) -> Result<Ended, Failure> {
+    let ControllerArguments { part: arguments, board } = arguments;
     let supervisor = Supervisor::of(arguments);
     let setup = Setup::read(&arguments.scenario, &arguments.set)?;
     let run = run_id(arguments, &setup)?;
     let process = ControllerProcess { arguments, setup: &setup, run, supervisor, allocations };
+    if let Some(address) = board {
+        let (ended, board) = process.run(BoardController::connect(&setup, &arguments.scenario, address)?)?;
+        return board.finish(arguments.out.as_deref(), ended);
+    }
     if !arguments.timing {
         let controller = RobotController::new(&setup)?;
         warn_of_reach(&setup.scenario, controller.out_of_reach_m());

@@ -11,6 +11,7 @@
 //! | [`input_file`] | files that are given to us |
 //! | [`setup`] | scenario and robot from their files, checked against each other |
 //! | [`simulated_robot`], [`robot_controller`] | plant and controller made from a setup |
+//! | [`board_robot`], [`board`] | a robot as a board has it; a board in the place of the controller |
 //! | [`faults`] | faults of messages on purpose |
 //! | [`run_folder`] | the folder a run leaves behind |
 //! | [`support`] | the hull of the feet, and what an inverted pendulum on it survives |
@@ -38,6 +39,8 @@
 //! | [`mod@plan`] | a motion planned through contact, or a plan file checked |
 //! | [`status_line`] | one line about the running run |
 
+pub mod board;
+pub mod board_robot;
 pub mod check;
 pub mod cli;
 pub mod colour;

@@ -14,14 +14,17 @@ use delmpc_mechanics::prelude::{
 };
 use delmpc_mechanics::velocity::VelocityWorkspace;
 use delmpc_robots::{BaseChoice, ImpossibleInertia, LoadOptions, RobotModel, load_with};
+use delmpc_scenario::Scenario;
 use nalgebra::{DMatrix, DVector, Quaternion, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
+use crate::board_robot::BoardRobot;
 use crate::drawing::drawing;
 use crate::init::files::posture_text;
 use crate::init::posture::stand_on;
 use crate::input_file::read_answerable;
 use crate::output::{line, name_in_table, print, printable};
+use crate::setup::Setup;
 use crate::stance::stances;
 use crate::verdict::{Ended, Failure};
 
@@ -48,9 +51,57 @@ pub struct ModelArguments {
     /// Solve for a posture on that sole of the companion table and print it as TOML, to be added there
     #[arg(long, value_name = "SOLE", conflicts_with_all = ["at", "svg"])]
     pub stand: Option<String>,
+    /// Print the robot as constants for a `no_std` build: tree, limits, soles, posture, weights, watchdog
+    #[arg(long, value_name = "LANGUAGE", conflicts_with_all = ["at", "svg", "stand", "base"])]
+    pub emit: Option<Language>,
+    /// Scenario that says stance, posture, weights, horizon and sensors of `--emit` [default: first sole and posture, default values]
+    #[arg(long, value_name = "SCENARIO.toml", requires = "emit")]
+    pub scenario: Option<PathBuf>,
+    /// Override a key of that scenario
+    #[arg(long, value_name = "KEY=VALUE", requires = "scenario")]
+    pub set: Vec<String>,
     /// Draw the robot in its postures
     #[arg(long, value_name = "FILE.svg", conflicts_with = "at")]
     pub svg: Option<PathBuf>,
+}
+
+/// A language of `--emit`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Language {
+    /// Rust.
+    Rust,
+}
+
+/// The robot as source: of the scenario, or of the URDF alone.
+fn emit(arguments: &ModelArguments) -> Result<String, Failure> {
+    let setup = match &arguments.scenario {
+        Some(file) => {
+            let setup = Setup::read(file, &arguments.set)?;
+            let same =
+                |a: &Path, b: &Path| matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b);
+            if !same(&setup.urdf, &arguments.urdf) {
+                return Err(Failure::Input(format!(
+                    "--scenario {}: its robot is {}, not {}",
+                    file.display(),
+                    setup.urdf.display(),
+                    arguments.urdf.display()
+                )));
+            }
+            setup
+        }
+        None => {
+            let robot = load_robot(arguments, None, None)?;
+            let mut scenario = Scenario { name: robot.name.clone(), ..Scenario::default() };
+            let missing = |what: &str| {
+                Failure::Input(format!("{}: no {what} in its companion table", arguments.urdf.display()))
+            };
+            let sole = robot.soles.first().ok_or_else(|| missing("sole"))?;
+            scenario.robot.stance = sole.name.as_str().into();
+            scenario.robot.posture = robot.postures.first().ok_or_else(|| missing("posture"))?.name.clone();
+            Setup { scenario, robot, urdf: arguments.urdf.clone(), notes: Vec::new() }
+        }
+    };
+    Ok(BoardRobot::new(&setup)?.rust())
 }
 
 /// Runs the command.
@@ -58,6 +109,10 @@ pub struct ModelArguments {
 /// # Errors
 /// A model or a state file that cannot be used.
 pub fn model(arguments: &ModelArguments) -> Result<Ended, Failure> {
+    if arguments.emit == Some(Language::Rust) {
+        print(&emit(arguments)?)?;
+        return Ok(Ended::Well);
+    }
     match &arguments.at {
         Some(file) => {
             let question = read_question(file)?;

@@ -282,7 +282,8 @@ fn point(robot: &RobotModel, frame: &str) -> Option<BodyPoint> {
     Some(BodyPoint { body: frame.body?, position: frame.pose.translation })
 }
 
-fn config(setup: &Setup) -> ControllerConfig {
+/// What is chosen for the controller of a robot on one foot, or on none.
+pub fn config(setup: &Setup) -> ControllerConfig {
     let scenario = &setup.scenario;
     // Where the mass centre of a robot is that cannot fall counts for nothing.
     let balances = f64::from(u8::from(setup.robot.tree.is_floating()));

@@ -332,19 +332,7 @@ fn config(setup: &Setup, holding: &Holding, start: &Start) -> Result<PlantConfig
         contact: ContactOptions { ground: ground(setup), ..ContactOptions::default() },
         sensors: sensors(setup)?,
         pushes: pushes.map(|push| made_push(robot, push, start)).collect::<Result<_, _>>()?,
-        watchdog: WatchdogConfig {
-            // Holds the start until there is a command; afterwards a plan that ran out is nearer to the robot than its start.
-            law: Some(AffineLaw::joint_stiffness(
-                &holding.torque,
-                &start.q,
-                &holding.gains.stiffness,
-                &holding.gains.damping,
-            )),
-            static_law: 0.0,
-            stiffness: holding.gains.stiffness.clone(),
-            damping: holding.gains.damping.clone(),
-            ..WatchdogConfig::default()
-        },
+        watchdog: held_by(holding, &start.q),
         monitor: monitor(setup, stance.unwrap_or(0)),
         seed: scenario.seed,
     })
@@ -361,6 +349,33 @@ fn monitor(setup: &Setup, stance_foot: usize) -> MonitorConfig {
             ..usual
         },
     }
+}
+
+/// The watchdog of a robot that is held like that.
+fn held_by(holding: &Holding, position: &[f64]) -> WatchdogConfig {
+    let HoldingGains { stiffness, damping } = &holding.gains;
+    WatchdogConfig {
+        // Holds the start until there is a command; afterwards a plan that ran out is nearer to the robot than its start.
+        law: Some(AffineLaw::joint_stiffness(&holding.torque, position, stiffness, damping)),
+        static_law: 0.0,
+        stiffness: stiffness.clone(),
+        damping: damping.clone(),
+        ..WatchdogConfig::default()
+    }
+}
+
+/// The watchdog of a scenario's servo.
+///
+/// # Errors
+/// [`Failure::Input`] when the robot cannot be held in its posture.
+pub fn watchdog(setup: &Setup) -> Result<WatchdogConfig, Failure> {
+    let start = setup.start()?;
+    let mut state = State::zeros(&setup.robot.tree);
+    state.base_pose = start.base_pose_w;
+    state.q.copy_from_slice(&start.q);
+    let holding = Holding::new(setup, &state);
+    let holding = holding.map_err(|error| Failure::Input(format!("{}: {error}", setup.scenario.name)))?;
+    Ok(held_by(&holding, &start.q))
 }
 
 fn terrain(scenario: &Scenario) -> Terrain {

@@ -17,6 +17,9 @@ pub enum PlantError {
     /// The model was refused.
     #[error("the robot's model is unusable: {0}")]
     Model(#[from] ModelError),
+    /// The servo's configuration was refused.
+    #[error(transparent)]
+    Servo(#[from] delmpc_servo::error::ServoError),
     /// A number of the configuration is outside its range.
     #[error("{quantity} is {value}, it must be {rule}")]
     Configuration {

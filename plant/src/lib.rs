@@ -9,7 +9,7 @@
 //! ```
 //!
 //! Reading order: [`plant`], [`contact_step`], [`contact_law`], [`friction_cone`], [`cone_program`], [`terrain`], [`monitor`],
-//! [`servo`], [`watchdog_gains`], [`actuators`], [`joint_stops`], [`sensors`], [`inertial_unit`], [`disturbances`].
+//! [`delmpc_servo`], [`watchdog_gains`], [`actuators`], [`joint_stops`], [`sensors`], [`inertial_unit`], [`disturbances`].
 //!
 //! Allocation: none in a warm [`plant::Plant::step`], except what Clarabel takes when a cone program is solved (measured in
 //! `tests/allocation.rs`); at rest none is.
@@ -49,7 +49,6 @@ pub mod monitor;
 pub mod plant;
 pub mod random;
 pub mod sensors;
-pub mod servo;
 pub(crate) mod step_newton;
 pub mod terrain;
 pub mod watchdog_gains;
@@ -68,7 +67,7 @@ pub mod prelude {
     pub use crate::monitor::{FallCause, Foot, FootReport, Monitor, MonitorConfig, Totals};
     pub use crate::plant::{Plant, PlantConfig, PlantModel, PlantStep};
     pub use crate::sensors::{Readings, SensorConfig};
-    pub use crate::servo::{AffineLaw, CommandRefused, WatchdogConfig};
     pub use crate::terrain::{Terrain, TerrainBox, TerrainGap};
     pub use crate::watchdog_gains::{HoldingGains, joint_inverse_inertia, spectral_radius};
+    pub use delmpc_servo::prelude::{AffineLaw, CommandRefused, WatchdogConfig};
 }

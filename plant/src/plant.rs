@@ -21,9 +21,9 @@ use crate::inertial_unit::InertialUnit;
 use crate::joint_stops::JointStops;
 use crate::monitor::{Foot, Monitor, MonitorConfig, StepWork};
 use crate::sensors::{Readings, SensorConfig, Sensors};
-use crate::servo::{CommandRefused, Servo, WatchdogConfig};
 use crate::terrain::Terrain;
 use crate::watchdog_gains::{joint_inverse_inertia, spectral_radius};
+use delmpc_servo::prelude::{CommandRefused, Servo, WatchdogConfig};
 
 /// The robot as its builders describe it.
 #[derive(Clone, Debug)]

@@ -157,6 +157,20 @@ impl Controller {
     /// # Errors
     /// [`ControlError`]: the first thing found wrong, with index and rule.
     pub fn new(model: ControllerModel, config: ControllerConfig) -> Result<Self, ControlError> {
+        let backend = default_backend(config.qp.capacity)
+            .map_err(|_| ControlError::Model { reason: "the QP solver refused its set-up" })?;
+        Self::with_backend(model, config, backend)
+    }
+
+    /// The same with a QP solver of the caller's.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn with_backend(
+        model: ControllerModel,
+        config: ControllerConfig,
+        backend: Box<dyn QpSolver + Send>,
+    ) -> Result<Self, ControlError> {
         model.check()?;
         config.check()?;
         let tree = &model.tree;
@@ -179,8 +193,6 @@ impl Controller {
         let horizon = HorizonProblem::new(&model, &config, cone.as_ref())?;
         let size = horizon.problem.size();
         let home = posture_goal(&model, &model.posture)?;
-        let backend = default_backend(config.qp.capacity)
-            .map_err(|_| ControlError::Model { reason: "the QP solver refused its set-up" })?;
         let mut command = Command::new(0, model.joint_set_hash, n as u32);
         command.fallback_level = FallbackLevel::ZeroTorque as u32;
         let samples = libm::round(RATE_MEAN_S / config.servo_period_s) as usize;

@@ -29,7 +29,6 @@ use crate::model::ControllerModel;
 use crate::node_kinematics::NodeKinematics;
 use crate::plan::Plan;
 use crate::reference::Reference;
-use crate::stage_dynamics::StageDynamics;
 use crate::tasks::{MAX_RESIDUALS, TaskTargets, Tasks};
 use delmpc_horizon::foot_cone::WrenchCone;
 use delmpc_lq::dare::{InfiniteHorizon, solve_dare};
@@ -201,15 +200,21 @@ impl HorizonProblem {
     pub fn stand_still(
         &mut self,
         tree: &KinematicTree,
-        dynamics: &mut StageDynamics,
+        dynamics: &mut HorizonDynamics,
         reference: &Reference,
         (x, torque): (&[f64], &[f64]),
         duration: f64,
     ) -> Result<InfiniteHorizon, ControlError> {
         let n = tree.dof();
         let size = LqSize { states: 2 * n, inputs: n, residuals: MAX_RESIDUALS, ..LqSize::default() };
-        let mut stage = LqStage::new(size);
-        dynamics.linearise(tree, x, torque, duration, x, &mut stage)?;
+        // At rest under the torque that carries it every node of the step is the posture, and so is its end.
+        let mut rest = Trajectory::new(LqSize { stages: 1, ..size });
+        rest.x_mut(0).copy_from_slice(x);
+        rest.x_mut(1).copy_from_slice(x);
+        rest.u_mut(0).copy_from_slice(torque);
+        let mut stages = [LqStage::new(size)];
+        dynamics.linearise(&rest, &[duration], &mut stages)?;
+        let [mut stage] = stages;
         for (target, weight) in stage.cost.input_weight.iter_mut().zip(&self.torque_weight) {
             *target = weight * duration;
         }

@@ -13,6 +13,7 @@
 //!
 //! Reading order: [`model`], [`config`], [`cycle`]; then in the order of the cycle [`estimator`], [`plan`], [`horizon_dynamics`],
 //! [`stage_dynamics`], [`node_kinematics`], [`tasks`], [`mod@reference`], [`contact_wrench`], the solver ([`delmpc_lq`]), [`fallback`].
+//! [`tables`] is a robot as constants, [`control_task`] cycle and servo on one processor: for firmware.
 //! [`legged`] is the same cycle for a robot on any set of feet, on the horizons of [`delmpc_horizon`]. Files without public items:
 //! `feedback_law.rs` (what a command carries), `level_stance.rs` (a foot that is not level), `unloaded_robot.rs` (one that carries
 //! nothing), `balance_trim.rs` (wrong masses), `prediction.rs` (delay).
@@ -27,6 +28,7 @@ extern crate std;
 mod balance_trim;
 pub mod config;
 pub mod contact_wrench;
+pub mod control_task;
 pub mod cycle;
 pub mod errors;
 pub mod estimator;
@@ -44,6 +46,7 @@ mod prediction;
 pub mod reference;
 pub mod stage_dynamics;
 mod stop_watch;
+pub mod tables;
 pub mod tasks;
 mod telling;
 mod unloaded_robot;

@@ -13,14 +13,13 @@ use alloc::vec;
 use alloc::vec::Vec;
 
 use delmpc_mechanics::errors::ModelError;
-use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
 use nalgebra::{Matrix3, Vector3};
 
 use crate::model::ControllerModel;
 use crate::node_kinematics::NodeKinematics;
 use crate::reference::PostureGoal;
 use crate::tasks::{MAX_RESIDUALS, TaskTargets, TaskWeights, Tasks};
-use delmpc_lq::kernels::{CholeskyScratch, factor, vector_mut};
+use delmpc_lq::kernels::{CholeskyScratch, factor, solve_factored};
 use delmpc_lq::lq_stage::{Residuals, StageCost};
 
 /// Steps of the iteration.
@@ -117,8 +116,7 @@ pub fn reach_posture(
             damping *= 10.0;
             continue;
         }
-        solve_lower_triangular_in_place(block.as_ref(), vector_mut(&mut step), faer::Par::Seq);
-        solve_upper_triangular_in_place(block.as_ref().transpose(), vector_mut(&mut step), faer::Par::Seq);
+        solve_factored(block.as_ref(), &mut step);
         let moved: Vec<f64> = (0..n)
             .map(|j| {
                 let limit = &model.limits[j];

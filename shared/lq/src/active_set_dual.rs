@@ -17,12 +17,11 @@
 use alloc::vec;
 use alloc::vec::Vec;
 
-use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
-use faer::{Mat, MatRef, Par};
+use faer::{Mat, MatRef};
 
 use crate::dual_qp::{Convexity, DualReport, QpSolver, UNBOUNDED, check_answer, check_data, dual_residual};
 use crate::errors::QpError;
-use crate::kernels::{CholeskyScratch, factor, vector_mut};
+use crate::kernels::{CholeskyScratch, factor, solve_factored};
 
 /// Added to the unit diagonal, so that dependent rows have a solution; far below the QP's tolerance.
 const REGULARIZATION: f64 = 1e-12;
@@ -115,8 +114,7 @@ impl ActiveSetDual {
         if count > 0 {
             factor(block.as_mut(), &mut self.scratch)?;
             let solution = &mut self.solution[..count];
-            solve_lower_triangular_in_place(block.as_ref(), vector_mut(solution), Par::Seq);
-            solve_upper_triangular_in_place(block.as_ref().transpose(), vector_mut(solution), Par::Seq);
+            solve_factored(block.as_ref(), solution);
             for (a, &i) in self.free.iter().enumerate() {
                 y[i] = self.solution[a];
             }

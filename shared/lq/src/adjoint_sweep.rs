@@ -223,7 +223,7 @@ fn divide<S: Simd>(simd: S, swept: &mut Panel, factor: &Panel, block: Range<usiz
         let mut sum = simd.sub_f64s(tile[c][0], earlier[c][0]);
         for (k, i) in block.clone().enumerate().take(c) {
             let weight = simd.splat_f64s(factor.column(i)[j]);
-            sum = simd.negate_mul_add_f64s(tile[k][0], weight, sum);
+            sum = simd.negate_mul_add_e_f64s(tile[k][0], weight, sum);
         }
         tile[c][0] = simd.mul_f64s(sum, simd.splat_f64s(1.0 / factor.column(j)[j]));
     }

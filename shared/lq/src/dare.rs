@@ -20,11 +20,10 @@
 use alloc::vec;
 use alloc::vec::Vec;
 
-use faer::linalg::solvers::{PartialPivLu, Solve};
 use faer::{Accum, Mat, MatRef};
 
 use crate::errors::LqError;
-use crate::kernels::gemm;
+use crate::kernels::{gemm, solve_general};
 use crate::lq_problem::{LqProblem, LqSize, LqStage};
 use crate::riccati::Riccati;
 
@@ -75,9 +74,7 @@ pub fn solve_dare(stage: &LqStage) -> Result<InfiniteHorizon, LqError> {
     for doubling in 0..MAX_DOUBLINGS {
         let mut w: Mat<f64> = Mat::identity(states, states);
         gemm(w.as_mut(), Accum::Add, g.as_ref(), h.as_ref(), 1.0);
-        let lu: PartialPivLu<f64> = w.partial_piv_lu();
-        let wa = lu.solve(&a_j);
-        let wg = lu.solve(&g);
+        let [wa, wg] = solve_general(&w, [&a_j, &g]);
         // H⁺ - H = A' H W⁻¹ A
         gemm(product.as_mut(), Accum::Replace, h.as_ref(), wa.as_ref(), 1.0);
         let mut increment: Mat<f64> = Mat::zeros(states, states);

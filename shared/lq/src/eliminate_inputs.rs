@@ -292,7 +292,7 @@ impl InTiles for TimesVector<'_> {
         for (l, value) in self.vector.iter().enumerate() {
             let (factor, column) = (simd.splat_f64s(*value), &registers[l * height + row..][..R]);
             for r in 0..R {
-                sums[r] = simd.mul_add_f64s(column[r], factor, sums[r]);
+                sums[r] = simd.mul_add_e_f64s(column[r], factor, sums[r]);
             }
         }
         self.out.registers_mut::<S>()[row..row + R].copy_from_slice(&sums);
@@ -341,7 +341,7 @@ impl InTiles for SubtractColumns<'_> {
                 let factor = simd.splat_f64s(entries[i * stride + j]);
                 let source = &registers[i * height + row..][..R];
                 for r in 0..R {
-                    sums[r] = simd.mul_add_f64s(source[r], factor, sums[r]);
+                    sums[r] = simd.mul_add_e_f64s(source[r], factor, sums[r]);
                 }
             }
         }
@@ -394,7 +394,7 @@ impl InTiles for BackSubstitute<'_> {
             for k in c + 1..TILE {
                 let weight = simd.splat_f64s(factor[k][c]);
                 for r in 0..R {
-                    tile[c][r] = simd.mul_add_f64s(tile[k][r], weight, tile[c][r]);
+                    tile[c][r] = simd.mul_add_e_f64s(tile[k][r], weight, tile[c][r]);
                 }
             }
             let scale = simd.splat_f64s(-factor[c][c]);

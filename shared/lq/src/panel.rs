@@ -198,7 +198,7 @@ impl pulp::WithSimd for TransposedTimes<'_> {
             for (c, sum) in sums.iter_mut().enumerate().take(out.len()) {
                 let column = &registers[(4 * four + c) * height..][..length];
                 for (entry, value) in column.iter().zip(vector) {
-                    *sum = simd.mul_add_f64s(*entry, *value, *sum);
+                    *sum = simd.mul_add_e_f64s(*entry, *value, *sum);
                 }
             }
             for (out, sum) in out.iter_mut().zip(sums) {
@@ -261,7 +261,7 @@ pub(crate) fn accumulate<S: Simd, const R: usize>(
         for c in 0..TILE {
             let factor = simd.splat_f64s(b[c]);
             for r in 0..R {
-                sums[c][r] = simd.mul_add_f64s(a[r], factor, sums[c][r]);
+                sums[c][r] = simd.mul_add_e_f64s(a[r], factor, sums[c][r]);
             }
         }
     }
@@ -290,7 +290,7 @@ pub(crate) fn accumulate_columns<S: Simd, const R: usize>(
         for c in 0..TILE {
             let factor = simd.splat_f64s(factors[c][l]);
             for r in 0..R {
-                sums[c][r] = simd.mul_add_f64s(a[r], factor, sums[c][r]);
+                sums[c][r] = simd.mul_add_e_f64s(a[r], factor, sums[c][r]);
             }
         }
     }

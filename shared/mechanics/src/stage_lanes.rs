@@ -7,11 +7,15 @@
 
 use core::ops::{Add, Div, Mul, Neg, Sub};
 
-use crate::lanes::{Number, Quad};
+use crate::lanes::Number;
+#[cfg(any(not(feature = "compact"), target_arch = "x86_64"))]
+use crate::lanes::Quad;
 
 mod instruction_sets;
 mod sin_cos;
 
+#[cfg(feature = "compact")]
+pub(crate) use instruction_sets::OneStage;
 pub(crate) use sin_cos::{LARGEST_ANGLE, sin_cos};
 
 /// One number of every stage of a vector, as it lies in memory.
@@ -23,6 +27,7 @@ pub(crate) trait StageMemory: Copy + Default {
     fn lanes_mut(&mut self) -> &mut [f64];
 }
 
+#[cfg(any(not(feature = "compact"), target_arch = "x86_64"))]
 impl StageMemory for Quad {
     const COUNT: usize = 4;
     fn fill(x: f64) -> Self {
@@ -38,11 +43,40 @@ impl StageMemory for Quad {
     }
 }
 
+/// One double: a stage by itself.
+#[cfg(feature = "compact")]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Single(pub [f64; 1]);
+
+#[cfg(feature = "compact")]
+impl StageMemory for Single {
+    const COUNT: usize = 1;
+    fn fill(x: f64) -> Self {
+        Self([x])
+    }
+    #[inline(always)]
+    fn lanes(&self) -> &[f64] {
+        &self.0
+    }
+    #[inline(always)]
+    fn lanes_mut(&mut self) -> &mut [f64] {
+        &mut self.0
+    }
+}
+
+/// How scalar code does the stages: one at a time with the feature `compact`, else four, as the vectors of other processors.
+#[cfg(feature = "compact")]
+pub(crate) type ScalarStages = OneStage;
+#[cfg(not(feature = "compact"))]
+pub(crate) type ScalarStages = crate::lanes::Portable;
+
 /// Eight doubles, one per stage.
+#[cfg(target_arch = "x86_64")]
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 #[repr(C, align(64))]
 pub(crate) struct Oct(pub [f64; 8]);
 
+#[cfg(target_arch = "x86_64")]
 impl StageMemory for Oct {
     const COUNT: usize = 8;
     fn fill(x: f64) -> Self {

@@ -1,5 +1,7 @@
 //! Why a message was refused.
 
+use crate::MAX_JOINTS;
+
 /// A message that cannot be used. Each text says which message, where in it, how much, and what to do.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[non_exhaustive]
@@ -42,7 +44,7 @@ pub enum MessageError {
     },
     /// The number of joints differs from ours or exceeds the capacity.
     #[error(
-        "{message}: {found} joints, expected {expected} (at most 32 fit); give both processes the same robot file"
+        "{message}: {found} joints, expected {expected} (at most {MAX_JOINTS} fit); give both processes the same robot file"
     )]
     WrongJointCount {
         /// The expected message.

@@ -18,7 +18,7 @@
 //! - SI units. Times are nanoseconds. Frames: suffix `_w` is the world, `_b` the body the quantity belongs to. Angular before linear.
 //!
 //! The crate is `no_std`, needs no allocator and never panics. Feature `shared_memory` adds the marker trait of the shared-memory
-//! transport; only `delmpc-transport` switches it on.
+//! transport; only `delmpc-transport` switches it on. Features `joints_4` and `joints_12` leave less room, for a microcontroller.
 //!
 //! Reading order: `header`, `joint_set`, `plant_state`, `command`, `servo_law`, `cycle_report`, `heartbeat`, `error`.
 
@@ -44,7 +44,18 @@ pub use plant_state::{ClockKind, FootReading, MAX_FEET, PlantState, foot, sensor
 pub use servo_law::{MAX_RATE_SAMPLES, RateMean, ServoReadings};
 
 /// Joints a message has room for. A larger robot needs a new version of [`PlantState`] and [`Command`].
-pub const MAX_JOINTS: usize = 32;
+pub const MAX_JOINTS: usize = if cfg!(feature = "joints_12") {
+    12
+} else if cfg!(feature = "joints_4") {
+    4
+} else {
+    32
+};
+
+#[cfg(all(feature = "shared_memory", any(feature = "joints_4", feature = "joints_12")))]
+compile_error!(
+    "messages in shared memory have room for 32 joints: joints_4 and joints_12 are for microcontrollers"
+);
 
 /// Largest joint position, joint velocity or base coordinate taken for real (rad, m, rad/s, m/s).
 pub const LARGEST_COORDINATE: f64 = 1e5;

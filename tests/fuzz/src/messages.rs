@@ -5,7 +5,7 @@ use delmpc::log::{read_command, read_record};
 use delmpc::log_reader::{Item, LogReader};
 use delmpc::truth::Truth;
 use delmpc_messages::{Command, FallbackLevel, Heartbeat, MAX_JOINTS, PlantState};
-use delmpc_plant::servo::{Servo, WatchdogConfig};
+use delmpc_servo::servo::{Servo, WatchdogConfig};
 
 use crate::numbers::Numbers;
 

@@ -8,9 +8,9 @@ use nalgebra::Vector3;
 
 use super::Controller;
 use crate::errors::ControlError;
+use crate::horizon_dynamics::HorizonDynamics;
 use crate::posture_goal::{posture_goal, reach_posture};
 use crate::reference::Reach;
-use crate::stage_dynamics::StageDynamics;
 
 /// A goal farther than this from where the hand is in the balanced posture nearest to it is moved there, m.
 const UNREACHABLE_M: f64 = 0.01;
@@ -26,7 +26,7 @@ impl Controller {
         let mut torque = vec![0.0; n];
         gravity_force_into(tree, self.node.kinematics(), &mut self.gravity, &mut torque)?;
         let last = self.config.stage_lengths().last().copied().unwrap_or(self.config.period_s);
-        let mut dynamics = StageDynamics::new(tree)?;
+        let mut dynamics = HorizonDynamics::new(tree, 1)?;
         let mut stand_still = |duration| {
             self.horizon.stand_still(tree, &mut dynamics, &self.reference, (&x, &torque), duration)
         };

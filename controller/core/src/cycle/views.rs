@@ -53,6 +53,11 @@ impl Controller {
         self.innovation_rate
     }
 
+    /// What was chosen for it.
+    pub fn config(&self) -> &ControllerConfig {
+        &self.config
+    }
+
     /// The model.
     pub fn model(&self) -> &ControllerModel {
         &self.model

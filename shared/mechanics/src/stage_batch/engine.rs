@@ -11,9 +11,12 @@ use super::{
     InstructionSet, StageInput, StageReport, StartKinematics, TransitionOutput, blocks, elimination, nodes,
 };
 use crate::errors::StepError;
+#[cfg(target_arch = "x86_64")]
 use crate::lanes::Quad;
 use crate::spatial::{RigidTransform, Twist, Wrench};
-use crate::stage_lanes::{Oct, StageMemory, StageSimd};
+#[cfg(target_arch = "x86_64")]
+use crate::stage_lanes::Oct;
+use crate::stage_lanes::{ScalarStages, StageMemory, StageSimd};
 use crate::tree::KinematicTree;
 
 /// Vectors of stages with the memory layout of one instruction set.
@@ -27,19 +30,25 @@ pub(crate) struct Work<M> {
 /// The memory of all stages and the instructions that work on it.
 #[derive(Clone, Debug)]
 pub(crate) enum Engine {
-    Portable(Work<Quad>),
+    Portable(Work<<ScalarStages as StageSimd>::Memory>),
     #[cfg(target_arch = "x86_64")]
     Avx2(pulp::x86::V3, Work<Quad>),
     #[cfg(target_arch = "x86_64")]
     Avx512(pulp::x86::V4, Work<Oct>),
 }
 
+/// Scalar code.
+#[cfg(feature = "compact")]
+pub(crate) const SCALAR: ScalarStages = crate::stage_lanes::OneStage;
+#[cfg(not(feature = "compact"))]
+pub(crate) const SCALAR: ScalarStages = crate::lanes::Portable;
+
 /// `$body` with `$work` bound to the memory, whatever its layout, and `$simd` to the instructions.
 macro_rules! with_work {
     ($engine:expr, $simd:ident, $work:ident => $body:expr) => {
         match $engine {
             Engine::Portable($work) => {
-                let $simd = crate::lanes::Portable;
+                let $simd = crate::stage_batch::engine::SCALAR;
                 $body
             }
             #[cfg(target_arch = "x86_64")]

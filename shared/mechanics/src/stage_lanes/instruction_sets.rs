@@ -2,10 +2,16 @@
 
 #[cfg(target_arch = "x86_64")]
 use super::Oct;
+#[cfg(feature = "compact")]
+use super::Single;
 use super::{StageKernel, StageSimd};
-use crate::lanes::{Portable, Quad, Simd};
+#[cfg(not(feature = "compact"))]
+use crate::lanes::Portable;
+#[cfg(any(not(feature = "compact"), target_arch = "x86_64"))]
+use crate::lanes::{Quad, Simd};
 
 /// The operations of four stages that are those of four nodes.
+#[cfg(any(not(feature = "compact"), target_arch = "x86_64"))]
 macro_rules! as_four_lanes {
     () => {
         type Memory = Quad;
@@ -49,6 +55,66 @@ macro_rules! as_four_lanes {
     };
 }
 
+/// One stage at a time.
+#[cfg(feature = "compact")]
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct OneStage;
+
+#[cfg(feature = "compact")]
+impl StageSimd for OneStage {
+    type Memory = Single;
+    type Vector = f64;
+    #[inline(always)]
+    fn splat(self, x: f64) -> f64 {
+        x
+    }
+    #[inline(always)]
+    fn load(self, memory: &Single) -> f64 {
+        memory.0[0]
+    }
+    #[inline(always)]
+    fn store(self, v: f64) -> Single {
+        Single([v])
+    }
+    #[inline(always)]
+    fn add(self, a: f64, b: f64) -> f64 {
+        a + b
+    }
+    #[inline(always)]
+    fn sub(self, a: f64, b: f64) -> f64 {
+        a - b
+    }
+    #[inline(always)]
+    fn mul(self, a: f64, b: f64) -> f64 {
+        a * b
+    }
+    #[inline(always)]
+    fn div(self, a: f64, b: f64) -> f64 {
+        a / b
+    }
+    #[inline(always)]
+    fn mul_add(self, a: f64, b: f64, c: f64) -> f64 {
+        a * b + c
+    }
+    #[inline(always)]
+    fn neg_mul_add(self, a: f64, b: f64, c: f64) -> f64 {
+        c - a * b
+    }
+    #[inline(always)]
+    fn max_abs(self, a: f64, x: f64) -> f64 {
+        a.max(x.abs())
+    }
+    #[inline(always)]
+    fn transpose(self, rows: &[Single], places: &[u32], out: &mut [Single]) {
+        out[0] = rows[places[0] as usize];
+    }
+    #[inline(always)]
+    fn run<K: StageKernel<Single>>(self, kernel: K) {
+        kernel.run(self);
+    }
+}
+
+#[cfg(not(feature = "compact"))]
 impl StageSimd for Portable {
     as_four_lanes!();
     #[inline(always)]
@@ -137,6 +203,7 @@ impl StageSimd for pulp::x86::V4 {
     }
 }
 
+#[cfg(any(not(feature = "compact"), target_arch = "x86_64"))]
 #[inline(always)]
 fn transpose_quads(rows: &[Quad], places: &[u32], out: &mut [Quad]) {
     let mut r = [[0.0; 4]; 4];

@@ -15,9 +15,13 @@
 //! Before the first command the static law holds, if there is one; else nothing does. Levels 2 and below are left after a number
 //! of good commands in a row.
 
+use alloc::boxed::Box;
+use alloc::vec;
+use alloc::vec::Vec;
+
 use delmpc_messages::{Command, FallbackLevel, MessageError, RateMean, ServoReadings, Verdict};
 
-use crate::error::{PlantError, require, require_length};
+use crate::error::ServoError;
 
 /// `u = torque + gain [q - q_ref; q̇]`: a law that holds a posture.
 #[derive(Clone, Debug, PartialEq)]
@@ -55,7 +59,7 @@ impl AffineLaw {
         }
     }
 
-    fn check(&self, joints: usize) -> Result<(), PlantError> {
+    fn check(&self, joints: usize) -> Result<(), ServoError> {
         for list in [&self.torque, &self.position_ref] {
             require_length("static law", list.len(), joints)?;
         }
@@ -159,6 +163,10 @@ pub enum CommandRefused {
     },
 }
 
+fn require_length(quantity: &'static str, got: usize, expected: usize) -> Result<(), ServoError> {
+    if got == expected { Ok(()) } else { Err(ServoError::Length { quantity, got, expected }) }
+}
+
 #[derive(Clone, Debug)]
 struct Slot {
     command: Command,
@@ -189,10 +197,12 @@ impl Servo {
     /// For `joints` joints with the given joint-set hash.
     ///
     /// # Errors
-    /// [`PlantError`] for times out of range or lists of the wrong length.
-    pub fn new(joints: usize, joint_set_hash: u64, config: WatchdogConfig) -> Result<Self, PlantError> {
+    /// [`ServoError`] for times out of range or lists of the wrong length.
+    pub fn new(joints: usize, joint_set_hash: u64, config: WatchdogConfig) -> Result<Self, ServoError> {
         for time in [config.hold_gains, config.static_law, config.gravity_hold, config.damping_only] {
-            require((0.0..1e9).contains(&time), "watchdog time", time, "in [0, 1e9) s")?;
+            if !(0.0..1e9).contains(&time) {
+                return Err(ServoError::Time { seconds: time });
+            }
         }
         let mut config = config;
         for list in [&mut config.stiffness, &mut config.damping] {
@@ -404,6 +414,7 @@ impl Servo {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
     use delmpc_messages::MAX_JOINTS;

@@ -1,0 +1,152 @@
+//! lamp: 6 joints. Written by `delmpc model --emit rust`; change the URDF or the scenario, not this.
+//!
+//! SI units; joints and bodies in the order of the messages, body 0 is the floating base.
+#![allow(clippy::all, dead_code, unused_imports)]
+#![cfg_attr(rustfmt, rustfmt_skip)]
+
+use delmpc_controller_core::config::{ConstraintConfig, ControllerConfig, ControllerKind, StageBlock};
+use delmpc_controller_core::fallback::FallbackConfig;
+use delmpc_controller_core::prelude::{JointLimits, Reach, TaskWeights};
+use delmpc_controller_core::tables::{BodyTable, PointTable, PoseTable, RobotTable, SoleTable, StanceTable};
+use delmpc_estimation::prelude::EstimatorConfig;
+use delmpc_lq::projected_qp::ProjectedQpOptions;
+use delmpc_servo::prelude::{AffineLaw, WatchdogConfig};
+
+/// Joint names.
+pub const JOINT_NAMES: [&str; 6] = ["swivel", "hip_roll", "hip_pitch", "elbow", "neck_pitch", "neck_roll"];
+
+/// The floating tree.
+pub const BODIES: [BodyTable; 7] = [
+    BodyTable { parent: None, prismatic: false, axis: [0.0, 0.0, 1.0], placement: PoseTable { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation: [0.0, 0.0, 0.0] }, damping: 0.0, stiffness: 0.0, rest: 0.0, mass: 3.0, com: [0.0, 0.0, 0.015], inertia: [[0.0083, 0.0, 0.0], [0.0, 0.0146, 0.0], [0.0, 0.0, 0.0225]] },
+    BodyTable { parent: Some(0), prismatic: false, axis: [0.0, 0.0, 1.0], placement: PoseTable { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation: [0.0, 0.0, 0.03] }, damping: 0.05, stiffness: 0.0, rest: 0.0, mass: 0.8, com: [0.0, 0.0, 0.015], inertia: [[0.0005, 0.0, 0.0], [0.0, 0.0005, 0.0], [0.0, 0.0, 0.0008]] },
+    BodyTable { parent: Some(1), prismatic: false, axis: [1.0, 0.0, 0.0], placement: PoseTable { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation: [0.0, 0.0, 0.05] }, damping: 0.05, stiffness: 0.0, rest: 0.0, mass: 0.6, com: [0.0, 0.0, 0.0], inertia: [[0.0003, 0.0, 0.0], [0.0, 0.0003, 0.0], [0.0, 0.0, 0.0003]] },
+    BodyTable { parent: Some(2), prismatic: false, axis: [0.0, 1.0, 0.0], placement: PoseTable { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation: [0.0, 0.0, 0.0] }, damping: 0.05, stiffness: 0.0, rest: 0.0, mass: 1.0, com: [0.0, 0.0, 0.16], inertia: [[0.0087, 0.0, 0.0], [0.0, 0.0087, 0.0], [0.0, 0.0, 0.0003]] },
+    BodyTable { parent: Some(3), prismatic: false, axis: [0.0, 1.0, 0.0], placement: PoseTable { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation: [0.0, 0.0, 0.32] }, damping: 0.05, stiffness: 0.0, rest: 0.0, mass: 0.9, com: [0.0, 0.0, 0.15], inertia: [[0.0069, 0.0, 0.0], [0.0, 0.0069, 0.0], [0.0, 0.0, 0.0003]] },
+    BodyTable { parent: Some(4), prismatic: false, axis: [0.0, 1.0, 0.0], placement: PoseTable { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation: [0.0, 0.0, 0.3] }, damping: 0.02, stiffness: 0.0, rest: 0.0, mass: 0.4, com: [0.0, 0.0, 0.0], inertia: [[0.0002, 0.0, 0.0], [0.0, 0.0002, 0.0], [0.0, 0.0, 0.0002]] },
+    BodyTable { parent: Some(5), prismatic: false, axis: [1.0, 0.0, 0.0], placement: PoseTable { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation: [0.0, 0.0, 0.0] }, damping: 0.02, stiffness: 0.0, rest: 0.0, mass: 0.9, com: [0.0, 0.0, 0.07], inertia: [[0.003, 0.0, 0.0], [0.0, 0.003, 0.0], [0.0, 0.0, 0.003]] },
+];
+
+/// Limits of the joints.
+pub const LIMITS: [JointLimits; 6] = [
+    JointLimits { lower: -2.5, upper: 2.5, effort: 20.0, velocity: 8.0 },
+    JointLimits { lower: -0.8, upper: 0.8, effort: 40.0, velocity: 8.0 },
+    JointLimits { lower: -1.2, upper: 1.2, effort: 40.0, velocity: 8.0 },
+    JointLimits { lower: -0.2, upper: 2.5, effort: 30.0, velocity: 8.0 },
+    JointLimits { lower: -1.8, upper: 1.8, effort: 12.0, velocity: 10.0 },
+    JointLimits { lower: -1.2, upper: 1.2, effort: 12.0, velocity: 10.0 },
+];
+
+/// Home posture.
+pub const POSTURE: [f64; 6] = [
+    0.0,
+    0.0,
+    -0.5,
+    1.0,
+    0.9,
+    0.0,
+];
+
+/// Corners of the sole `foot`.
+pub const SOLE_0: [[f64; 2]; 4] = [
+    [-0.12, -0.09],
+    [0.12, -0.09],
+    [0.12, 0.09],
+    [-0.12, 0.09],
+];
+
+/// The soles.
+pub const SOLES: [SoleTable<'static>; 1] = [
+    SoleTable { body: 0, frame: PoseTable { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation: [0.0, 0.0, 0.0] }, polygon: &SOLE_0 },
+];
+/// The robot.
+pub const ROBOT: RobotTable<'static> = RobotTable {
+    joint_set_hash: 0x35316c51159010dc,
+    gravity_w: [0.0, 0.0, -9.81],
+    bodies: &BODIES,
+    limits: &LIMITS,
+    posture: &POSTURE,
+    stance: Some(StanceTable {
+        soles: &SOLES, stance: 0, imu_body: 0,
+        imu_mounting: PoseTable { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation: [0.0, 0.0, 0.0] },
+        sensors: EstimatorConfig { sample_s: 0.001, gyro_noise: 0.002, gyro_bias: 0.001, gyro_bias_walk: 1e-5, accelerometer_noise: 0.02, accelerometer_bias: 0.01, accelerometer_bias_walk: 0.0001, position_noise: 2e-5, velocity_noise: 0.002, contact_velocity: 0.001, contact_walk: 0.001, sole_rate: 0.01, first_tilt: 0.05, foot_force_noise: 2.0, load_on: 0.05, load_off: 0.02, debounce_s: 0.002 },
+    }),
+    hand: None,
+    swing_foot: None,
+};
+pub const STAGES: [StageBlock; 4] = [
+    StageBlock { count: 1, seconds: 0.005 },
+    StageBlock { count: 2, seconds: 0.006 },
+    StageBlock { count: 2, seconds: 0.012 },
+    StageBlock { count: 5, seconds: 0.11179999999999998 },
+];
+pub const WEIGHTS: TaskWeights = TaskWeights { posture: 20.0, joint_speed: 0.5, torque: 500.0, com: [2000.0, 2000.0, 0.0], com_velocity: [200.0, 200.0, 0.0], spin: [0.0, 0.0, 0.0], hand: 10000.0, hand_velocity: 10.0, swing_foot: [0.0, 0.0, 1000.0], swing_foot_rotation: 5.0 };
+pub const CONSTRAINTS: ConstraintConfig = ConstraintConfig { torque_fraction: 0.98, friction: 0.6, friction_sides: 8, cop_margin_m: 0.003, yaw_arm_m: 0.06, min_force_fraction: 0.1, contact_penalty: 1.0, position_penalty: 10000.0, velocity_penalty: 1000.0 };
+pub const QP: ProjectedQpOptions = ProjectedQpOptions { capacity: 32, rows_per_round: 24, max_rounds: 8, tolerance: 1e-9, pivots: 12 };
+
+/// Times, weights and limits of the controller.
+pub fn config() -> ControllerConfig {
+    ControllerConfig {
+        kind: ControllerKind::Mpc,
+        period_s: 0.005,
+        servo_period_s: 0.001,
+        delay_s: 0.005,
+        stages: STAGES.to_vec(),
+        weights: WEIGHTS,
+        constraints: CONSTRAINTS,
+        qp: QP,
+        reach: None,
+        fallback: FallbackConfig { good_cycles: 5, plan_age_s: 1.0, lqr_s: 1.3, hold_s: 2.0, damping_s: 4.0 },
+        max_state_age_s: 0.05,
+        command_life_s: 0.1,
+        budget_s: 0.005,
+        trim_s: 1.0,
+        mismatch_rate: 1.0,
+    }
+}
+
+pub const HOLD_TORQUE: [f64; 6] = [
+    0.0,
+    0.0,
+    0.9853352803019828,
+    -3.078198876821065,
+    -0.6090374966247681,
+    0.0,
+];
+pub const HOLD_POSITION: [f64; 6] = [
+    0.0,
+    0.0,
+    -0.5,
+    1.0,
+    0.9,
+    0.0,
+];
+pub const HOLD_STIFFNESS: [f64; 6] = [
+    3.3727363128635424,
+    84.25751274517657,
+    86.88144905804009,
+    25.23698737929087,
+    1.095840000000017,
+    1.067040000000004,
+];
+pub const HOLD_DAMPING: [f64; 6] = [
+    0.3934859031674133,
+    1.3767668083863998,
+    1.890879060674399,
+    2.9443151942506014,
+    0.127848000000002,
+    0.12448800000000046,
+];
+
+/// What the servo does without a command.
+pub fn watchdog() -> WatchdogConfig {
+    WatchdogConfig {
+        hold_gains: 1.0,
+        static_law: 0.0,
+        gravity_hold: 0.5,
+        damping_only: 1.0,
+        law: Some(AffineLaw::joint_stiffness(&HOLD_TORQUE, &HOLD_POSITION, &HOLD_STIFFNESS, &HOLD_DAMPING)),
+        stiffness: HOLD_STIFFNESS.to_vec(),
+        damping: HOLD_DAMPING.to_vec(),
+        good_commands: 3,
+    }
+}
