@@ -100,7 +100,7 @@ fn make_plan(file: &Path, arguments: &PlanArguments) -> Result<Ended, Failure> {
         seed: scenario.seed,
         refine_to: (settings.refine_stages > 0).then_some(settings.refine_stages),
         budget: (settings.budget_s > 0.0).then(|| Duration::from_secs_f64(settings.budget_s)),
-        ..Search::default()
+        ..Search::of(&task.robot)
     };
     let bar = progress_bar(arguments.json);
     let planned = search_plan(&task, &scenario.name, &search, |report| {
@@ -165,7 +165,12 @@ fn task_of(
         bounds.push((robot.coordinate(&bound.coordinate)?, bound.min, bound.max));
     }
     let [sole, shank] = settings.outline_points;
-    let clearance = if sole + shank > 0 { leg_outline(&robot, sole, shank)? } else { Vec::new() };
+    let clearance = if sole + shank > 0 {
+        leg_outline(&robot, sole, shank)?
+    } else {
+        // Spheres must not dip under the ground between the nodes.
+        robot.contacts.iter().filter(|contact| contact.radius > 0.0).cloned().collect()
+    };
     Ok(Task {
         terrain: terrain_of(settings),
         stages: settings.stages,

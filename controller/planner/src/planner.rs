@@ -13,6 +13,7 @@ use crate::newton::{Curvature, Minimiser};
 use crate::plan_file::Plan;
 use crate::problem::Problem;
 use crate::refine::refine;
+use crate::robot::PlanRobot;
 use crate::task::Task;
 
 /// Largest violation from which a plan is projected on DEL = 0.
@@ -38,6 +39,14 @@ pub struct Search {
     pub budget: Option<Duration>,
     /// How curvature enters.
     pub curvature: Curvature,
+}
+
+impl Search {
+    /// The search for a robot: the schedule of its kind, everything else by default.
+    pub fn of(robot: &PlanRobot) -> Self {
+        let schedule = if robot.planar { Schedule::planar() } else { Schedule::spatial() };
+        Self { schedule, ..Self::default() }
+    }
 }
 
 impl Default for Search {
