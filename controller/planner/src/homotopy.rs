@@ -20,7 +20,7 @@ use std::time::Duration;
 use crate::barrier::Barrier;
 use crate::contact_law::Homotopy;
 use crate::error::PlanError;
-use crate::newton::{Effort, Minimiser};
+use crate::newton::{Effort, MOST_HALVINGS, Minimiser};
 
 /// Rounds at the last κ.
 const LAST_ROUNDS: usize = 14;
@@ -46,6 +46,8 @@ pub struct Schedule {
     pub first_factor: f64,
     /// Factor from one κ to the next in pass 2.
     pub second_factor: f64,
+    /// Halvings of a step before it is repeated with more regularisation: a line search (12), or nearly a trust region (1).
+    pub halvings: usize,
     /// Newton iterations per round.
     pub iterations: usize,
     /// Violation below which pass 1 goes on to the next κ before its rounds are over.
@@ -72,6 +74,7 @@ impl Schedule {
             first_penalty: 0.05,
             first_factor: 0.35,
             second_factor: 0.3,
+            halvings: MOST_HALVINGS,
             iterations: 80,
             first_tolerance: 1e-3,
             first_rounds: 2,
@@ -85,6 +88,7 @@ impl Schedule {
     pub fn spatial() -> Self {
         Self {
             keeps_penalty: true,
+            halvings: 1,
             kappa_start: 0.03,
             kappa_between: 1e-6,
             first_tolerance: 1e-4,
@@ -267,6 +271,7 @@ fn climb(
     watch: &mut Watcher<'_>,
 ) -> Result<Outcome, PlanError> {
     let homotopy = Homotopy { kappa: rung.kappa, sigma: rung.sigma };
+    minimiser.halvings = schedule.halvings;
     let mut delta = rung.delta;
     if schedule.keeps_penalty {
         delta = delta.min(minimiser.last_penalty);

@@ -30,10 +30,10 @@ const MEMORY: usize = 3;
 const MOST_REGULARISATION: f64 = 1e14;
 /// Regularisations tried at one point before a minimisation gives up.
 const MOST_ATTEMPTS: usize = 12;
-/// Of these, how many with a full and a half step only.
+/// Of these, how many with the halvings that are asked for.
 const PATIENT_ATTEMPTS: usize = 9;
-/// Halvings of a step after that.
-const MOST_HALVINGS: usize = 12;
+/// Most halvings of a step.
+pub const MOST_HALVINGS: usize = 12;
 /// Largest curvature multiplier.
 const MOST_CURVATURE: f64 = 1e6;
 
@@ -84,6 +84,8 @@ pub struct Minimiser<'a> {
     pub bound_estimates: Vec<[f64; 2]>,
     /// How curvature enters.
     pub curvature: Curvature,
+    /// Halvings of a step before it is repeated with more regularisation.
+    pub halvings: usize,
     /// Effort so far.
     pub effort: Effort,
     pub(crate) engine: Engine,
@@ -143,6 +145,7 @@ impl<'a> Minimiser<'a> {
             estimates: vec![rows.clone(); stages],
             bound_estimates: vec![[0.0; 2]; size],
             curvature: Curvature::Exact,
+            halvings: MOST_HALVINGS,
             effort: Effort::default(),
             derivatives: vec![StageDerivatives::new(problem, &supports); stages],
             curvatures: vec![rows.clone(); stages],
@@ -284,11 +287,12 @@ impl<'a> Minimiser<'a> {
                 self.step[i] = if self.fixed[i] { 0.0 } else { -self.gradient[i] };
             }
             self.chain.solve(&mut self.step);
-            let halvings = if attempt < PATIENT_ATTEMPTS { 1 } else { MOST_HALVINGS };
+            let halvings = if attempt < PATIENT_ATTEMPTS { self.halvings } else { MOST_HALVINGS };
             if let Some(fraction) = self.search(homotopy, barrier, bound, halvings) {
                 return Ok(Some(fraction));
             }
-            self.regularisation = (10.0 * self.regularisation).max(1e-5);
+            let factor = if self.halvings < MOST_HALVINGS { 10.0 } else { 100.0 };
+            self.regularisation = (factor * self.regularisation).max(1e-5);
         }
         Ok(None)
     }
@@ -393,7 +397,14 @@ impl<'a> Minimiser<'a> {
 
     /// A full step says that less would do.
     fn adapt_regularisation(&mut self, fraction: f64) {
-        let factor = if fraction >= 0.9 { 0.25 } else { 1.0 };
+        let enough = if self.halvings < MOST_HALVINGS { 0.9 } else { 0.3 };
+        let factor = if fraction >= enough {
+            0.25
+        } else if fraction >= 0.05 {
+            1.0
+        } else {
+            6.0
+        };
         self.regularisation = (factor * self.regularisation).max(1e-7);
     }
 
