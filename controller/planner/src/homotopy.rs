@@ -9,11 +9,11 @@
 //! P4     converged or |∇Φ| < 10: y := ŷ, z := ẑ;   violation below the tolerance: next κ;   above ¼ of the last: δ := δ/3
 //! ```
 //!
-//! [`Schedule::planar`] is the one of the handbook's jump: rough first pass, second pass with fresh multipliers.
-//! [`Schedule::spatial`] takes the first pass to the end: multipliers and δ are kept from one κ to the next (a δ that grows
-//! again undoes what the rounds before have paid for), it begins where robots still slide but no longer freely (from κ = 1 all
-//! guesses become the same symmetric slide, whose fastest instability is a patter of all feet), and the second pass is for
-//! what has not converged then.
+//! [`Schedule::planar`]: a rough first pass, a second pass with fresh multipliers.
+//! [`Schedule::one_pass`] takes the first pass to the end: multipliers and δ are kept from one κ to the next (a δ that grows
+//! again undoes what the rounds before have paid for), and the second pass is for what has not converged then.
+//! [`Schedule::spatial`] is that, begun where robots still slide but no longer freely: from κ = 1 all guesses become the same
+//! symmetric slide, whose fastest instability is a patter of all feet.
 
 use std::time::Duration;
 
@@ -63,7 +63,7 @@ pub struct Schedule {
 }
 
 impl Schedule {
-    /// Settings for robots in a plane.
+    /// Settings for robots in a plane: two passes.
     pub fn planar() -> Self {
         Self {
             keeps_penalty: false,
@@ -84,17 +84,21 @@ impl Schedule {
         }
     }
 
-    /// Settings for robots in space.
-    pub fn spatial() -> Self {
+    /// One pass that keeps its multipliers and δ to the end: for tasks with bounds on what happens before an impact.
+    pub fn one_pass() -> Self {
         Self {
             keeps_penalty: true,
             halvings: 1,
-            kappa_start: 0.03,
             kappa_between: 1e-6,
             first_tolerance: 1e-4,
             first_rounds: 4,
             ..Self::planar()
         }
+    }
+
+    /// Settings for robots in space: one pass, begun where robots slide but no longer freely.
+    pub fn spatial() -> Self {
+        Self { kappa_start: 0.03, ..Self::one_pass() }
     }
 }
 

@@ -13,7 +13,6 @@ use crate::newton::{Curvature, Minimiser};
 use crate::plan_file::Plan;
 use crate::problem::Problem;
 use crate::refine::refine;
-use crate::robot::PlanRobot;
 use crate::task::Task;
 
 /// Largest violation from which a plan is projected on DEL = 0.
@@ -42,9 +41,15 @@ pub struct Search {
 }
 
 impl Search {
-    /// The search for a robot: the schedule of its kind, everything else by default.
-    pub fn of(robot: &PlanRobot) -> Self {
-        let schedule = if robot.planar { Schedule::planar() } else { Schedule::spatial() };
+    /// The search for a task: the schedule of its kind, everything else by default.
+    pub fn of(task: &Task) -> Self {
+        let schedule = if task.standing.is_some() || (task.robot.planar && task.execution.is_none()) {
+            Schedule::planar()
+        } else if task.robot.planar {
+            Schedule::one_pass()
+        } else {
+            Schedule::spatial()
+        };
         Self { schedule, ..Self::default() }
     }
 }

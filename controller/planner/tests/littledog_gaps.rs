@@ -6,7 +6,7 @@ mod common;
 use delmpc_planner::planner::{Planned, Search, plan};
 
 fn search() -> Search {
-    Search::of(&common::robot("littledog"))
+    Search::of(&common::littledog_gaps(28))
 }
 
 fn assert_walks(planned: &Planned) {
