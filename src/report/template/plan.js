@@ -117,7 +117,7 @@ function steps(title, unit, series, names) {
   for (let i = 0; i <= 4; i++) {
     const y = low + (high - low) * i / 4;
     body += `<line x1="${LEFT}" x2="${WIDTH - RIGHT}" y1="${Y(y)}" y2="${Y(y)}" stroke="var(--rule)"/>` +
-      label(Y(y) + 4, `${y.toPrecision(2)}${i === 4 ? ` ${unit}` : ""}`.replace("-", "−"));
+      label(Y(y) + (i === 4 ? 10 : 4), `${y.toFixed(high - low > 10 ? 0 : 2)}${i === 4 ? ` ${unit}` : ""}`.replace("-", "−"));
   }
   series.forEach((values, i) => {
     let path = "";
