@@ -243,6 +243,7 @@ fn terrain_of(settings: &PlanSettings) -> Terrain {
         edge_margin_m: settings.edge_margin_m,
         obstacle_margin_m: settings.obstacle_margin_m,
         ground_slack_m: 0.0,
+        tails_m: 0.0,
     }
 }
 

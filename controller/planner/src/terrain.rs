@@ -76,6 +76,9 @@ pub struct Terrain {
     /// How far a contact point may sink below the ground, m.
     #[serde(default)]
     pub ground_slack_m: f64,
+    /// Half of the length over which a forbidden stretch opens in plans of the handbook's prototype, m; 0 for ours.
+    #[serde(default)]
+    pub tails_m: f64,
 }
 
 /// A function of x with two derivatives.
@@ -123,6 +126,16 @@ fn window(x: f64, a: f64, b: f64) -> Profile {
     }
 }
 
+/// `rise(x - a) rise(b - x)`: the forbidden stretch of the handbook's prototype, with tails outside.
+fn window_with_tails(x: f64, a: f64, b: f64, softness: f64) -> Profile {
+    let (up, down) = (rise(x - a, softness), rise(b - x, softness));
+    Profile {
+        value: up.value * down.value,
+        slope: up.slope * down.value - up.value * down.slope,
+        curvature: up.curvature * down.value - 2.0 * up.slope * down.slope + up.value * down.curvature,
+    }
+}
+
 impl Terrain {
     /// Level ground without anything on it.
     pub fn flat() -> Self {
@@ -155,7 +168,8 @@ impl Terrain {
         let gaps = self.gaps.iter().map(|gap| (gap.from_m - margin, gap.to_m + margin));
         let steps = self.steps.iter().map(|step| (step.x_m - margin, step.x_m + margin));
         for (a, b) in gaps.chain(steps) {
-            let w = window(x, a, b);
+            let w =
+                if self.tails_m > 0.0 { window_with_tails(x, a, b, self.tails_m) } else { window(x, a, b) };
             total.add(Profile {
                 value: WINDOW_DEPTH_M * w.value,
                 slope: WINDOW_DEPTH_M * w.slope,
