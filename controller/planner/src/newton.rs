@@ -28,6 +28,8 @@ const ARMIJO: f64 = 1e-4;
 const MEMORY: usize = 3;
 /// Largest regularisation tried.
 const MOST_REGULARISATION: f64 = 1e14;
+/// Whole line searches refused in a row, each repeated with a hundred times the regularisation, before a minimisation gives up.
+const MOST_REFUSALS: usize = 4;
 /// Regularisations tried at one point before a minimisation gives up.
 const MOST_ATTEMPTS: usize = 12;
 /// Of these, how many with the halvings that are asked for.
@@ -251,6 +253,7 @@ impl<'a> Minimiser<'a> {
     ) -> Result<Descent, PlanError> {
         let tolerance = 1e-2 * (1e-3 / barrier.delta).min(1.0);
         let mut remembered = Vec::with_capacity(MEMORY);
+        let mut refusals = 0;
         let mut descent = Descent { gradient: f64::INFINITY, converged: false };
         for iteration in 0..=most_iterations {
             let value = self.linearise(homotopy, barrier);
@@ -266,7 +269,12 @@ impl<'a> Minimiser<'a> {
             self.effort.iterations += 1;
             let bound = remembered.iter().copied().fold(f64::NEG_INFINITY, f64::max);
             match self.step_within(homotopy, barrier, bound)? {
-                Some(fraction) => self.adapt_regularisation(fraction),
+                Some(fraction) => {
+                    refusals = 0;
+                    self.adapt_regularisation(fraction);
+                }
+                // After a whole line search: once more, also with what the search remembers moved on.
+                None if self.halvings == MOST_HALVINGS && refusals < MOST_REFUSALS => refusals += 1,
                 None => break,
             }
         }
@@ -281,7 +289,9 @@ impl<'a> Minimiser<'a> {
         barrier: Barrier,
         bound: f64,
     ) -> Result<Option<f64>, PlanError> {
-        for attempt in 0..MOST_ATTEMPTS {
+        let whole_search = self.halvings == MOST_HALVINGS;
+        let attempts = if whole_search { 1 } else { MOST_ATTEMPTS };
+        for attempt in 0..attempts {
             self.factorise()?;
             for i in 0..self.x.len() {
                 self.step[i] = if self.fixed[i] { 0.0 } else { -self.gradient[i] };
@@ -291,8 +301,11 @@ impl<'a> Minimiser<'a> {
             if let Some(fraction) = self.search(homotopy, barrier, bound, halvings) {
                 return Ok(Some(fraction));
             }
-            let factor = if self.halvings < MOST_HALVINGS { 10.0 } else { 100.0 };
-            self.regularisation = (factor * self.regularisation).max(1e-5);
+            self.regularisation = if whole_search {
+                100.0 * self.regularisation
+            } else {
+                (10.0 * self.regularisation).max(1e-5)
+            };
         }
         Ok(None)
     }
