@@ -68,6 +68,7 @@ pub mod one_process;
 pub mod output;
 pub mod part;
 pub mod plan;
+pub mod plan_page;
 pub mod plant;
 pub mod plant_process;
 pub mod push_map;

@@ -17,6 +17,7 @@ use delmpc_scenario::{Document, PlanSettings, PlanWeightSettings, Scenario};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::colour::Colour;
+use crate::plan_page;
 use crate::verdict::{Ended, Failure};
 
 /// Arguments of `delmpc plan`.
@@ -25,7 +26,7 @@ pub struct PlanArguments {
     /// Scenario with a section `[plan]`
     #[arg(required_unless_present = "check")]
     pub scenario: Option<PathBuf>,
-    /// Where the plan goes [default: runs/SCENARIO.plan.json]
+    /// Where the plan goes; its page goes beside it as .html [default: runs/SCENARIO.plan.json]
     #[arg(long, value_name = "PLAN")]
     pub out: Option<PathBuf>,
     /// Override a key of the scenario, for example --set plan.stages=36; may be given several times
@@ -40,6 +41,9 @@ pub struct PlanArguments {
     /// Robot of the checked plan [default: configs/robots/NAME.urdf with the plan's robot name]
     #[arg(long, value_name = "URDF", requires = "check")]
     pub robot: Option<PathBuf>,
+    /// Write the page of the checked plan here
+    #[arg(long, value_name = "HTML", requires = "check")]
+    pub page: Option<PathBuf>,
     /// Print one JSON object with every figure and nothing else
     #[arg(long)]
     pub json: bool,
@@ -77,7 +81,12 @@ fn check_plan(file: &Path, arguments: &PlanArguments) -> Result<Ended, Failure> 
     }
     .map_err(Failure::input)?;
     let findings = check(&plan, &robot).map_err(Failure::input)?;
-    say(&plan, &findings, execute(&plan, &robot).ok().as_ref(), arguments.json)?;
+    let found = execute(&plan, &robot).ok();
+    say(&plan, &findings, found.as_ref(), arguments.json)?;
+    if let Some(page) = &arguments.page {
+        let html = plan_page::page(&plan, &robot, &findings, found.as_ref())?;
+        std::fs::write(page, html).map_err(|error| Failure::Fault(format!("{}: {error}", page.display())))?;
+    }
     let holds = findings.passes(&Bounds::default());
     Ok(if holds { Ended::Well } else { Ended::CriterionMissed })
 }
@@ -100,7 +109,7 @@ fn make_plan(file: &Path, arguments: &PlanArguments) -> Result<Ended, Failure> {
         seed: scenario.seed,
         refine_to: (settings.refine_stages > 0).then_some(settings.refine_stages),
         budget: (settings.budget_s > 0.0).then(|| Duration::from_secs_f64(settings.budget_s)),
-        ..Search::default()
+        ..Search::of(&task)
     };
     let bar = progress_bar(arguments.json);
     let planned = search_plan(&task, &scenario.name, &search, |report| {
@@ -125,9 +134,13 @@ fn make_plan(file: &Path, arguments: &PlanArguments) -> Result<Ended, Failure> {
     let text = planned.plan.to_json().map_err(Failure::fault)?;
     std::fs::write(&out, text).map_err(|error| Failure::Fault(format!("{}: {error}", out.display())))?;
     let found = execute(&planned.plan, &task.robot).ok();
+    let page = out.with_extension("html");
+    let html = plan_page::page(&planned.plan, &task.robot, &planned.findings, found.as_ref())?;
+    std::fs::write(&page, html).map_err(|error| Failure::Fault(format!("{}: {error}", page.display())))?;
     say(&planned.plan, &planned.findings, found.as_ref(), arguments.json)?;
     if !arguments.json {
-        say_attempts(&planned, &out);
+        say_attempts(&planned);
+        println!("{}\n{}", out.display(), page.display());
     }
     let done = planned.converged && planned.findings.passes(&Bounds::default());
     Ok(if done { Ended::Well } else { Ended::CriterionMissed })
@@ -165,7 +178,12 @@ fn task_of(
         bounds.push((robot.coordinate(&bound.coordinate)?, bound.min, bound.max));
     }
     let [sole, shank] = settings.outline_points;
-    let clearance = if sole + shank > 0 { leg_outline(&robot, sole, shank)? } else { Vec::new() };
+    let clearance = if sole + shank > 0 {
+        leg_outline(&robot, sole, shank)?
+    } else {
+        // Spheres must not dip under the ground between the nodes.
+        robot.contacts.iter().filter(|contact| contact.radius > 0.0).cloned().collect()
+    };
     Ok(Task {
         terrain: terrain_of(settings),
         stages: settings.stages,
@@ -225,6 +243,7 @@ fn terrain_of(settings: &PlanSettings) -> Terrain {
         edge_margin_m: settings.edge_margin_m,
         obstacle_margin_m: settings.obstacle_margin_m,
         ground_slack_m: 0.0,
+        tails_m: 0.0,
     }
 }
 
@@ -329,7 +348,7 @@ fn say(plan: &Plan, findings: &Findings, found: Option<&Execution>, json: bool) 
     Ok(())
 }
 
-fn say_attempts(planned: &Planned, out: &Path) {
+fn say_attempts(planned: &Planned) {
     for attempt in &planned.attempts {
         let how = if attempt.converged { "converged" } else { attempt.trouble.as_str() };
         println!(
@@ -342,5 +361,4 @@ fn say_attempts(planned: &Planned, out: &Path) {
             attempt.time_s
         );
     }
-    println!("{}", out.display());
 }

@@ -165,8 +165,9 @@ pub fn terrain_of(plan: &Plan) -> Terrain {
             (gap.get(0).and_then(Value::as_f64), gap.get(1).and_then(Value::as_f64))
         {
             terrain.gaps.push(Gap { from_m, to_m });
-            // The first version let a point sink by half a millimetre beside a hole.
+            // The first version let a point sink by half a millimetre beside a hole, whose window had tails.
             terrain.ground_slack_m = 5e-4;
+            terrain.tails_m = 4e-3;
         }
     }
     terrain

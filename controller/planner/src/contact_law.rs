@@ -35,6 +35,9 @@ pub(crate) const IMPULSE_SOFTNESS: f64 = 1e-4;
 /// Softening of the length of a slip, m.
 pub(crate) const SLIP_SOFTNESS: f64 = 1e-5;
 
+/// Softness of a tangential impulse over κ: a cone that is as round as the products are loose keeps Newton's full steps.
+const SOFTNESS_PER_KAPPA: f64 = 10.0;
+
 /// Constants of the law, the same for all contacts of a plan.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LawConstants {
@@ -53,8 +56,17 @@ pub struct LawConstants {
 pub struct Homotopy {
     /// Bound of the products, S m.
     pub kappa: f64,
-    /// How far forbidden stretches and obstacles have grown, 0 to 1.
+    /// How far obstacles have grown, 0 to 1.
     pub sigma: f64,
+}
+
+impl Homotopy {
+    /// Softening of the lengths of a tangential impulse (units of S) and of a slip (m): cones are round while κ is large.
+    pub fn softness(&self) -> [f64; 2] {
+        let impulse = (SOFTNESS_PER_KAPPA * self.kappa).clamp(IMPULSE_SOFTNESS, 0.1);
+        let slip = (0.1 * SOFTNESS_PER_KAPPA * self.kappa).clamp(SLIP_SOFTNESS, 0.01);
+        [impulse, slip]
+    }
 }
 
 impl LawConstants {
@@ -139,10 +151,12 @@ struct Evaluation<'a> {
     x: &'a [f64],
     /// `φ`: height of the ground at the nodes.
     ground: [Profile; 3],
-    /// `φ'` = φ + σ d Π: the additional part.
+    /// `φ'` = φ + d Π: the additional part.
     forbidden: [Profile; 3],
     /// How far the gap rows let a point sink.
     slack: f64,
+    /// Softening of the lengths of a tangential impulse and of a slip.
+    softness: [f64; 2],
 }
 
 impl LawRows {
@@ -189,15 +203,10 @@ impl<'a> Evaluation<'a> {
             for node in 0..3 {
                 let along = x[law.position(node)];
                 ground[node] = terrain.height(along);
-                let part = terrain.forbidden(along);
-                forbidden[node] = Profile {
-                    value: homotopy.sigma * part.value,
-                    slope: homotopy.sigma * part.slope,
-                    curvature: homotopy.sigma * part.curvature,
-                };
+                forbidden[node] = terrain.forbidden(along);
             }
         }
-        Self { law, x, ground, forbidden, slack: terrain.ground_slack_m }
+        Self { law, x, ground, forbidden, slack: terrain.ground_slack_m, softness: homotopy.softness() }
     }
 
     fn height(&self, node: usize) -> usize {
@@ -246,8 +255,8 @@ impl<'a> Evaluation<'a> {
                 }
             }
             if law.tangents == 2 {
-                out.value[3 + node] = law.friction * n - soft_length(tau2, IMPULSE_SOFTNESS);
-                out.value[6 + node] = bound - soft_length(slip2, SLIP_SOFTNESS);
+                out.value[3 + node] = law.friction * n - soft_length(tau2, self.softness[0]);
+                out.value[6 + node] = bound - soft_length(slip2, self.softness[1]);
             }
             product += law.friction * n * bound;
         }
@@ -307,7 +316,7 @@ impl<'a> Evaluation<'a> {
             let (cone, slip) = (3 + node, 6 + node);
             out.gradient[cone][n] += law.friction;
             let impulse = [x[tau], x[tau + 1]];
-            let (gradient, hessian) = soft_length_derivatives(impulse, IMPULSE_SOFTNESS);
+            let (gradient, hessian) = soft_length_derivatives(impulse, self.softness[0]);
             for t in 0..2 {
                 out.gradient[cone][tau + t] -= gradient[t];
                 for u in 0..2 {
@@ -316,7 +325,7 @@ impl<'a> Evaluation<'a> {
             }
             out.gradient[slip][bound] += 1.0;
             let slips = [self.slip(node, 0), self.slip(node, 1)];
-            let (gradient, hessian) = soft_length_derivatives([slips[0].0, slips[1].0], SLIP_SOFTNESS);
+            let (gradient, hessian) = soft_length_derivatives([slips[0].0, slips[1].0], self.softness[1]);
             for t in 0..2 {
                 for (index, factor) in slips[t].1 {
                     out.gradient[slip][index] -= gradient[t] * factor;

@@ -5,7 +5,7 @@
 //! N2 factorise the chain (crate::chain)
 //! N3 a Cholesky fails: add reg diag(scale^-2), reg := 6 reg, repeat; after success keep reg/4
 //! N4 step cap: no position, angle or 3 m/s above 0.5; non-monotone Armijo
-//! N5 full step refused: up to 3 second-order corrections with the same factors, only then halve the step
+//! N5 full step refused: up to 3 second-order corrections with the same factors, then half the step, then 10 reg
 //! N6 after an accepted step: l := l + α (l̂ - l) with what the linearised rows say, l̂ = ŷ - D J dx
 //! ```
 //!
@@ -28,8 +28,14 @@ const ARMIJO: f64 = 1e-4;
 const MEMORY: usize = 3;
 /// Largest regularisation tried.
 const MOST_REGULARISATION: f64 = 1e14;
-/// Refused steps in a row, each repeated with a hundred times the regularisation, before a minimisation gives up.
+/// Whole line searches refused in a row, each repeated with a hundred times the regularisation, before a minimisation gives up.
 const MOST_REFUSALS: usize = 4;
+/// Regularisations tried at one point before a minimisation gives up.
+const MOST_ATTEMPTS: usize = 12;
+/// Of these, how many with the halvings that are asked for.
+const PATIENT_ATTEMPTS: usize = 9;
+/// Most halvings of a step.
+pub const MOST_HALVINGS: usize = 12;
 /// Largest curvature multiplier.
 const MOST_CURVATURE: f64 = 1e6;
 
@@ -80,6 +86,8 @@ pub struct Minimiser<'a> {
     pub bound_estimates: Vec<[f64; 2]>,
     /// How curvature enters.
     pub curvature: Curvature,
+    /// Halvings of a step before it is repeated with more regularisation.
+    pub halvings: usize,
     /// Effort so far.
     pub effort: Effort,
     pub(crate) engine: Engine,
@@ -100,6 +108,8 @@ pub struct Minimiser<'a> {
     scale: Vec<f64>,
     pub(crate) fixed: Vec<bool>,
     regularisation: f64,
+    /// δ of the last minimisation since the multipliers were forgotten.
+    pub(crate) last_penalty: f64,
     pub(crate) chain: Chain,
     pub(crate) z: Vec<f64>,
     pub(crate) rows: Vec<f64>,
@@ -137,6 +147,7 @@ impl<'a> Minimiser<'a> {
             estimates: vec![rows.clone(); stages],
             bound_estimates: vec![[0.0; 2]; size],
             curvature: Curvature::Exact,
+            halvings: MOST_HALVINGS,
             effort: Effort::default(),
             derivatives: vec![StageDerivatives::new(problem, &supports); stages],
             curvatures: vec![rows.clone(); stages],
@@ -155,6 +166,7 @@ impl<'a> Minimiser<'a> {
             scale,
             fixed,
             regularisation: 1e-7,
+            last_penalty: f64::INFINITY,
             chain: Chain::new(engine.arch, layout, stages),
             z: vec![0.0; layout.stage],
             rows,
@@ -170,6 +182,7 @@ impl<'a> Minimiser<'a> {
             list.fill(0.0);
         }
         self.bound_estimates.fill([0.0; 2]);
+        self.last_penalty = f64::INFINITY;
         self.regularisation = 1e-7;
     }
 
@@ -254,25 +267,47 @@ impl<'a> Minimiser<'a> {
             }
             remembered.push(value);
             self.effort.iterations += 1;
+            let bound = remembered.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+            match self.step_within(homotopy, barrier, bound)? {
+                Some(fraction) => {
+                    refusals = 0;
+                    self.adapt_regularisation(fraction);
+                }
+                // After a whole line search: once more, also with what the search remembers moved on.
+                None if self.halvings == MOST_HALVINGS && refusals < MOST_REFUSALS => refusals += 1,
+                None => break,
+            }
+        }
+        Ok(descent)
+    }
+
+    /// One step: a full or half one, or one with more regularisation. Shortening a step by a line search shortens the stiff
+    /// directions with the flat ones; regularisation shortens the flat ones only. Returns the fraction taken.
+    fn step_within(
+        &mut self,
+        homotopy: Homotopy,
+        barrier: Barrier,
+        bound: f64,
+    ) -> Result<Option<f64>, PlanError> {
+        let whole_search = self.halvings == MOST_HALVINGS;
+        let attempts = if whole_search { 1 } else { MOST_ATTEMPTS };
+        for attempt in 0..attempts {
             self.factorise()?;
             for i in 0..self.x.len() {
                 self.step[i] = if self.fixed[i] { 0.0 } else { -self.gradient[i] };
             }
             self.chain.solve(&mut self.step);
-            let bound = remembered.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-            match self.search(homotopy, barrier, bound) {
-                Some(fraction) => {
-                    refusals = 0;
-                    self.adapt_regularisation(fraction);
-                }
-                None if refusals < MOST_REFUSALS => {
-                    refusals += 1;
-                    self.regularisation *= 100.0;
-                }
-                None => break,
+            let halvings = if attempt < PATIENT_ATTEMPTS { self.halvings } else { MOST_HALVINGS };
+            if let Some(fraction) = self.search(homotopy, barrier, bound, halvings) {
+                return Ok(Some(fraction));
             }
+            self.regularisation = if whole_search {
+                100.0 * self.regularisation
+            } else {
+                (10.0 * self.regularisation).max(1e-5)
+            };
         }
-        Ok(descent)
+        Ok(None)
     }
 
     /// Rows, derivatives, gradient and matrix at `x`; returns `Φ`.
@@ -373,9 +408,10 @@ impl<'a> Minimiser<'a> {
         Ok(())
     }
 
-    /// A full step says that less would do, a tiny one that the quadratic model holds no further than a shorter step.
+    /// A full step says that less would do.
     fn adapt_regularisation(&mut self, fraction: f64) {
-        let factor = if fraction >= 0.3 {
+        let enough = if self.halvings < MOST_HALVINGS { 0.9 } else { 0.3 };
+        let factor = if fraction >= enough {
             0.25
         } else if fraction >= 0.05 {
             1.0
@@ -436,11 +472,11 @@ impl<'a> Minimiser<'a> {
     }
 
     /// Moves along the step; returns the fraction taken, none when no decrease was found.
-    fn search(&mut self, homotopy: Homotopy, barrier: Barrier, bound: f64) -> Option<f64> {
+    fn search(&mut self, homotopy: Homotopy, barrier: Barrier, bound: f64, halvings: usize) -> Option<f64> {
         let first = self.cap(&self.step);
         let slope: f64 = self.gradient.iter().zip(&self.step).map(|(g, d)| g * d).sum();
         let mut fraction = first;
-        for halving in 0..13 {
+        for halving in 0..=halvings {
             for i in 0..self.x.len() {
                 self.trial[i] = self.x[i] + fraction * self.step[i];
             }

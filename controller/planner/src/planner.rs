@@ -40,6 +40,20 @@ pub struct Search {
     pub curvature: Curvature,
 }
 
+impl Search {
+    /// The search for a task: the schedule of its kind, everything else by default.
+    pub fn of(task: &Task) -> Self {
+        let schedule = if task.standing.is_some() || (task.robot.planar && task.execution.is_none()) {
+            Schedule::planar()
+        } else if task.robot.planar {
+            Schedule::one_pass()
+        } else {
+            Schedule::spatial()
+        };
+        Self { schedule, ..Self::default() }
+    }
+}
+
 impl Default for Search {
     fn default() -> Self {
         Self {

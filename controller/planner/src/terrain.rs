@@ -2,20 +2,21 @@
 //!
 //! ```text
 //! gap of a contact point          φ  = z - r - height(x)
-//! gap in the products             φ' = φ + σ d Π(x)          Π: smooth window of every forbidden stretch
+//! gap in the products             φ' = φ + d Π(x)            Π = (1 - r²)³ over every forbidden stretch, r = -1 .. 1 across it
 //! clearance of a leg              z - height(x) >= σ h(x)    h = H/(1 + ((x - x_o)/half_width)^6)
 //! ```
 //!
-//! A force inside a window costs `d` of complementarity, so it vanishes: there is no slope to stand on and no pit to fall
-//! into, and the gap itself keeps the feet at or above the ground everywhere. The edges of a step are windows too, so every
-//! foothold lies on level ground. `σ` grows from 0 to 1 in the first steps of the homotopy.
+//! A force inside a forbidden stretch costs `d Π` of complementarity, so it vanishes. Π falls off from the middle everywhere,
+//! so a foot that still carries there is pushed out, and it is exactly zero outside, so a foothold at the margin is as good as
+//! any other: a window with tails lets footholds creep away from the edge for hundreds of iterations. The gap itself keeps
+//! the feet at or above the ground everywhere. The edges of a step are such stretches too, so every foothold lies on level
+//! ground. `σ` of the obstacles grows from 0 to 1 in the first steps of the homotopy; Π needs no growth, it only counts
+//! when κ is below `d`.
 //!
 //! Everything varies along x only and is uniform across: what a plan straight ahead needs.
 
 use serde::{Deserialize, Serialize};
 
-/// Half of the length over which a window opens, m.
-const WINDOW_SOFTNESS_M: f64 = 0.004;
 /// Complementarity of a unit force inside a window, m.
 const WINDOW_DEPTH_M: f64 = 0.08;
 /// Half of the length over which the smooth height of a step rises, m.
@@ -75,6 +76,9 @@ pub struct Terrain {
     /// How far a contact point may sink below the ground, m.
     #[serde(default)]
     pub ground_slack_m: f64,
+    /// Half of the length over which a forbidden stretch opens in plans of the handbook's prototype, m; 0 for ours.
+    #[serde(default)]
+    pub tails_m: f64,
 }
 
 /// A function of x with two derivatives.
@@ -107,8 +111,23 @@ fn rise(x: f64, softness: f64) -> Profile {
     }
 }
 
-/// `rise(x - a) rise(b - x)`.
-fn window(x: f64, a: f64, b: f64, softness: f64) -> Profile {
+/// `(1 - r²)³` between `a` and `b`, 0 outside; `r` is -1 at `a` and 1 at `b`.
+fn window(x: f64, a: f64, b: f64) -> Profile {
+    let half = 0.5 * (b - a);
+    let r = (x - 0.5 * (a + b)) / half;
+    let inside = 1.0 - r * r;
+    if inside <= 0.0 {
+        return Profile::default();
+    }
+    Profile {
+        value: inside * inside * inside,
+        slope: -6.0 * r * inside * inside / half,
+        curvature: 6.0 * inside * (4.0 * r * r - inside) / (half * half),
+    }
+}
+
+/// `rise(x - a) rise(b - x)`: the forbidden stretch of the handbook's prototype, with tails outside.
+fn window_with_tails(x: f64, a: f64, b: f64, softness: f64) -> Profile {
     let (up, down) = (rise(x - a, softness), rise(b - x, softness));
     Profile {
         value: up.value * down.value,
@@ -149,7 +168,8 @@ impl Terrain {
         let gaps = self.gaps.iter().map(|gap| (gap.from_m - margin, gap.to_m + margin));
         let steps = self.steps.iter().map(|step| (step.x_m - margin, step.x_m + margin));
         for (a, b) in gaps.chain(steps) {
-            let w = window(x, a, b, WINDOW_SOFTNESS_M);
+            let w =
+                if self.tails_m > 0.0 { window_with_tails(x, a, b, self.tails_m) } else { window(x, a, b) };
             total.add(Profile {
                 value: WINDOW_DEPTH_M * w.value,
                 slope: WINDOW_DEPTH_M * w.slope,

@@ -57,11 +57,12 @@ pub fn littledog_gaps(stages: usize) -> Task {
     Task {
         terrain: Terrain {
             gaps: vec![Gap { from_m: 0.11, to_m: 0.17 }, Gap { from_m: 0.47, to_m: 0.56 }],
+            edge_margin_m: 0.025,
             ..Terrain::flat()
         },
         stages,
         horizon_s: 2.8,
-        distance_m: 0.7,
+        distance_m: 0.72,
         speed_m_s: (0.0, 0.0),
         start,
         friction: 0.7,
@@ -70,12 +71,14 @@ pub fn littledog_gaps(stages: usize) -> Task {
         rate_limit: 12.0,
         bounds: Vec::new(),
         base: BaseBounds { attitude_rad: 0.5, height_m: (0.08, 0.25) },
-        clearance: Vec::new(),
+        clearance: robot.contacts.clone(),
         weights: PlanWeights {
             torque_nm: 0.3,
             base_attitude: 2.0,
             base_height: 20.0,
             posture: 0.3,
+            joint_rate: 1e-2,
+            end_base: 200.0,
             ..PlanWeights::default()
         },
         alike: Vec::new(),
