@@ -63,6 +63,7 @@ pub mod log_viewer;
 pub mod mesh_file;
 pub mod metrics;
 pub mod model;
+mod model_table;
 pub mod observer;
 pub mod one_process;
 pub mod output;

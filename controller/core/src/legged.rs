@@ -15,22 +15,20 @@ use alloc::boxed::Box;
 use alloc::vec;
 use alloc::vec::Vec;
 
-use delmpc_estimation::prelude::{EstimatorConfig, EstimatorModel};
 use delmpc_horizon::base_path::BasePath;
 use delmpc_horizon::contact_schedule::{ContactSchedule, Foothold};
-use delmpc_horizon::gait::{Gait, GaitWalk};
+use delmpc_horizon::gait::GaitWalk;
 use delmpc_horizon::ground_plane::GroundPlane;
-use delmpc_horizon::legged_model::{FootShape, LeggedModel};
+use delmpc_horizon::legged_model::FootShape;
 use delmpc_horizon::legged_problem::LeggedProblem;
-use delmpc_horizon::legged_tasks::LeggedWeights;
 use delmpc_horizon::motion_plan::MotionPlan;
-use delmpc_horizon::motion_reference::{MotionReference, SwingShape};
+use delmpc_horizon::motion_reference::MotionReference;
 use delmpc_horizon::retiming::Retiming;
 use delmpc_horizon::stage_grid::StageGrid;
-use delmpc_horizon::step_plan::{Step, lay_out, mass_centre_over};
+use delmpc_horizon::step_plan::{lay_out, mass_centre_over};
 use delmpc_lq::dual_qp::QpSolver;
 use delmpc_lq::kernels::largest;
-use delmpc_lq::projected_qp::{ProjectedQp, ProjectedQpOptions, default_backend};
+use delmpc_lq::projected_qp::{ProjectedQp, default_backend};
 use delmpc_lq::riccati::Riccati;
 use delmpc_lq::trajectory::Trajectory;
 use delmpc_mechanics::contact_stage::BoundaryState;
@@ -39,21 +37,23 @@ use delmpc_messages::{
 };
 use nalgebra::{Vector2, Vector3};
 
-use crate::config::{ConstraintConfig, ControllerKind};
+use crate::config::ControllerKind;
 use crate::cycle::reason;
 use crate::errors::ControlError;
-use crate::fallback::{Attempt, FallbackConfig, FallbackLadder, Situation};
+use crate::fallback::{Attempt, FallbackLadder, Situation};
 use crate::feedback_law::Law;
 use crate::stop_watch::{Clock, StopWatch};
 use crate::telling::tell_constraints;
 
 mod base_feedback;
+mod config;
 mod law;
 mod light_feet;
 mod prediction;
 mod sensing;
 
 use base_feedback::BaseFeedback;
+pub use config::{GaitCommand, LeggedConfig, LeggedRobot, Motion};
 use light_feet::LightFeet;
 use prediction::StatePrediction;
 use sensing::LeggedSensing;
@@ -69,84 +69,6 @@ const DEEPEST_CROUCH: f64 = 0.12;
 const UNREACHED: f64 = 100.0;
 /// States in a row that are older than the newest one are right, and the newest one was wrong.
 const OLDER_STATES: u32 = 5;
-
-/// What the robot is to do.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Motion {
-    /// Stand on all feet.
-    Stand,
-    /// Go by a gait.
-    Gait(GaitCommand),
-    /// Go by single steps, in the order of time.
-    Steps(Vec<Step>),
-}
-
-/// A gait and the way.
-#[derive(Clone, Debug, PartialEq)]
-pub struct GaitCommand {
-    /// Times of the feet.
-    pub gait: Gait,
-    /// Forward and to the left, m/s.
-    pub velocity: [f64; 2],
-    /// Turning to the left, rad/s.
-    pub yaw_rate: f64,
-    /// When the first foot lifts off, s.
-    pub start_s: f64,
-    /// When the robot has stopped, s; infinite: never.
-    pub stop_s: f64,
-    /// How long it takes to be at speed, s.
-    pub ramp_s: f64,
-}
-
-/// Robot and sensors.
-#[derive(Clone, Debug)]
-pub struct LeggedRobot {
-    /// The robot; its joints in the order of the messages.
-    pub model: LeggedModel,
-    /// What the estimator knows of it; the same feet.
-    pub estimator: EstimatorModel,
-    /// How good the sensors are.
-    pub sensors: EstimatorConfig,
-    /// Hash of the joint set of the messages.
-    pub joint_set_hash: u64,
-}
-
-/// Everything that is chosen.
-#[derive(Clone, Debug, PartialEq)]
-pub struct LeggedConfig {
-    /// Which law: the static LQR is none of a legged robot.
-    pub kind: ControllerKind,
-    /// Time between cycles, s.
-    pub period_s: f64,
-    /// Time between two evaluations of the command's feedback law in the plant, s.
-    pub servo_period_s: f64,
-    /// From the time of a measurement to the time its command takes effect, s.
-    pub delay_s: f64,
-    /// Stage lengths without switches, s.
-    pub stage_lengths: Vec<f64>,
-    /// Weights of the tasks.
-    pub weights: LeggedWeights,
-    /// Limits of the plan.
-    pub limits: ConstraintConfig,
-    /// How a foot swings.
-    pub swing: SwingShape,
-    /// By how much the robot crouches before it steps, m; 0: by its legs.
-    pub crouch_m: f64,
-    /// What to do.
-    pub motion: Motion,
-    /// The constrained QP.
-    pub qp: ProjectedQpOptions,
-    /// When to fall back.
-    pub fallback: FallbackConfig,
-    /// Oldest measurement that is used, s.
-    pub max_state_age_s: f64,
-    /// How long a command may be applied, s.
-    pub command_life_s: f64,
-    /// Time a cycle may take before it is called late, s.
-    pub budget_s: f64,
-    /// Time over which the servo takes the mean of velocities, s.
-    pub rate_mean_s: f64,
-}
 
 /// The controller: everything it needs for a cycle. Memory is taken in [`LeggedController::new`], and in the first good cycle, which
 /// places feet and steps where the robot has been measured.
