@@ -7,7 +7,7 @@
 //! | `φ`, `ω_i` | deviation of the gyroscope's sum and of its rate, in the axes of the inertial unit |
 //! | `M`, `a_j` | axes of the inertial unit in those of the base; axes of the joints between the two |
 //! | `r`, `J = ∂r/∂q`, `J̇` | a standing foot from the base's mass centre, in the base's axes |
-//! | `s` | share of the feet in the weight, as planned, those that are felt to carry something |
+//! | `s` | share of the feet in the weight, as planned, of those that are flat and felt to carry something |
 //!
 //! ```text
 //! θ = M φ - Σ_j a_j δq_j                          ω = M ω_i - Σ_j a_j δq̇_j + Σ_j a_j × (ω₀ + Σ_{k ≤ j} a_k q̇_k) δq_j

@@ -61,7 +61,8 @@ impl LeggedController {
         let mut row = 0;
         for (foot, shape) in robot.model.feet.iter().enumerate() {
             row += shape.contact().row_count();
-            if schedule.stands(foot, begin_s) && sensing.feet()[foot].loaded {
+            // A point rolls, rubs and bounces: where it is says less of the base than the plan does.
+            if shape.is_flat() && schedule.stands(foot, begin_s) && sensing.feet()[foot].loaded {
                 shares[foot] = plan.force(stage)[row - 1].max(0.0) / robot.model.weight_n();
             }
         }
