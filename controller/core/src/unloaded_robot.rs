@@ -17,13 +17,16 @@
 //!
 //! Source: own formulation. Sampled stiffness and damping: K. Åström, B. Wittenmark, *Computer-Controlled Systems*, 1997, chapter 3.
 
+use alloc::vec;
 use alloc::vec::Vec;
 
+use delmpc_lq::kernels::{CholeskyScratch, factor, solve_factored};
 use delmpc_mechanics::kinematics::{Configuration, Kinematics};
-use delmpc_mechanics::spatial::Twist;
+use delmpc_mechanics::spatial::{SpatialInertia, Twist};
 use delmpc_mechanics::tree::KinematicTree;
 use delmpc_messages::Command;
-use nalgebra::{DMatrix, Vector3};
+use faer::Mat;
+use nalgebra::Vector3;
 
 use crate::errors::ControlError;
 use crate::level_stance::LevelStance;
@@ -34,6 +37,8 @@ const FREQUENCY: f64 = 60.0;
 const DAMPING_RATIO: f64 = 0.8;
 /// Largest `w` times the servo's period.
 const LARGEST_STEP: f64 = 0.1;
+/// Steps of the power iteration: it is a constructor's.
+const POWER_ITERATIONS: usize = 300;
 /// Part of the weight on the foot from which on the robot has its full torque.
 const FULL_LOAD: f64 = 0.2;
 
@@ -56,13 +61,10 @@ impl UnloadedRobot {
     ) -> Result<Self, ControlError> {
         let inverse = inverse_inertia_in_the_air(tree, posture)?;
         let n = tree.dof();
-        // D^½ M⁻¹ D^½ with d_j = I_j has the eigenvalues of M⁻¹ D.
-        let scaled =
-            DMatrix::from_fn(n, n, |i, j| inverse[(i, j)] / libm::sqrt(inverse[(i, i)] * inverse[(j, j)]));
-        let largest = scaled.symmetric_eigenvalues().iter().copied().fold(0.0, f64::max);
+        let largest = largest_eigenvalue_with_joint_inertias(&inverse);
         let frequency = FREQUENCY.min(LARGEST_STEP / servo_period_s);
         let gains = (0..n).map(|joint| {
-            let damping = 2.0 * DAMPING_RATIO * frequency / (largest * inverse[(joint, joint)]);
+            let damping = 2.0 * DAMPING_RATIO * frequency / (largest * inverse[joint][joint]);
             (damping * frequency / (2.0 * DAMPING_RATIO), damping)
         });
         let full_load_n = FULL_LOAD * tree.total_mass() * tree.gravity_w().norm();
@@ -100,7 +102,7 @@ impl UnloadedRobot {
 }
 
 /// The joints' block of `M⁻¹` with nothing fixed, 1/(kg m²), for the `tree` fixed at a foot.
-fn inverse_inertia_in_the_air(tree: &KinematicTree, posture: &[f64]) -> Result<DMatrix<f64>, ControlError> {
+fn inverse_inertia_in_the_air(tree: &KinematicTree, posture: &[f64]) -> Result<Vec<Vec<f64>>, ControlError> {
     let n = tree.dof();
     let mut kinematics = Kinematics::new(tree);
     kinematics.update_positions(tree, &Configuration::fixed(posture))?;
@@ -110,8 +112,8 @@ fn inverse_inertia_in_the_air(tree: &KinematicTree, posture: &[f64]) -> Result<D
         3..6 => Twist::new(Vector3::zeros(), axis(column)),
         _ => kinematics.joint_twists_w()[column - 6],
     };
-    let mut inertia = DMatrix::<f64>::zeros(6 + n, 6 + n);
-    let mut add = |columns: &[usize], body: &delmpc_mechanics::spatial::SpatialInertia| {
+    let mut inertia = Mat::<f64>::zeros(6 + n, 6 + n);
+    let mut add = |columns: &[usize], body: &SpatialInertia| {
         for &column in columns {
             let momentum = body.mul_twist(&twist(column));
             for &row in columns {
@@ -126,16 +128,41 @@ fn inverse_inertia_in_the_air(tree: &KinematicTree, posture: &[f64]) -> Result<D
         columns.extend(tree.branch(body).iter().map(|joint| 6 + *joint as usize));
         add(&columns, &kinematics.inertia_w(tree, body));
     }
-    let inverse = inertia
-        .cholesky()
-        .ok_or(ControlError::Model { reason: "its mass matrix with the foot in the air is singular" })?
-        .inverse();
-    Ok(inverse.view((6, 6), (n, n)).into_owned())
+    factor(inertia.as_mut(), &mut CholeskyScratch::new(6 + n))
+        .ok_or(ControlError::Model { reason: "its mass matrix with the foot in the air is singular" })?;
+    let column = |joint: usize| {
+        let mut column = vec![0.0; 6 + n];
+        column[6 + joint] = 1.0;
+        solve_factored(inertia.as_ref(), &mut column);
+        column.split_off(6)
+    };
+    Ok((0..n).map(column).collect())
+}
+
+/// The largest eigenvalue of `M⁻¹ D` with `d_j = I_j`, by power iteration.
+fn largest_eigenvalue_with_joint_inertias(inverse: &[Vec<f64>]) -> f64 {
+    let n = inverse.len();
+    // No joint's direction is missed, no two are alike.
+    let mut direction: Vec<f64> = (0..n).map(|j| 1.0 + 0.1 * libm::sin(j as f64)).collect();
+    let mut product = vec![0.0; n];
+    let mut largest = 0.0;
+    for _ in 0..POWER_ITERATIONS {
+        for (value, row) in product.iter_mut().zip(inverse) {
+            *value = (0..n).map(|j| row[j] / inverse[j][j] * direction[j]).sum();
+        }
+        largest = libm::sqrt(product.iter().map(|x| x * x).sum());
+        if largest <= 0.0 {
+            break;
+        }
+        direction.iter_mut().zip(&product).for_each(|(x, value)| *x = value / largest);
+    }
+    largest
 }
 
 #[cfg(test)]
 mod tests {
     use delmpc_mechanics::prelude::*;
+    use nalgebra::DMatrix;
 
     use super::*;
 
@@ -152,10 +179,10 @@ mod tests {
         let tree = tree.build().unwrap();
         let robot = UnloadedRobot::new(&tree, 0, &[0.0; 3], 1e-3).unwrap();
         let inverse = inverse_inertia_in_the_air(&tree, &[0.0; 3]).unwrap();
-        let damping = DMatrix::from_fn(3, 3, |i, j| if i == j { robot.gains[i].1 } else { 0.0 });
-        let fastest = (&inverse * damping).complex_eigenvalues().iter().map(|v| v.re).fold(0.0, f64::max);
+        let driven = DMatrix::from_fn(3, 3, |i, j| inverse[i][j] * robot.gains[j].1);
+        let fastest = driven.complex_eigenvalues().iter().map(|v| v.re).fold(0.0, f64::max);
         assert!((fastest / (2.0 * DAMPING_RATIO * FREQUENCY) - 1.0).abs() < 1e-9, "{fastest}");
         // A joint between bodies of 1.01 and 1: alone it moves half of it, with the pelvis free the pelvis.
-        assert!((1.0 / inverse[(1, 1)] - 0.01 / 1.01).abs() < 1e-4, "{}", 1.0 / inverse[(1, 1)]);
+        assert!((1.0 / inverse[1][1] - 0.01 / 1.01).abs() < 1e-4, "{}", 1.0 / inverse[1][1]);
     }
 }

@@ -313,7 +313,7 @@ impl Estimator {
                 let lever = point.norm_squared() * 2.0 / 3.0;
                 let velocity = c.velocity_noise * c.velocity_noise * legs.0[axis]
                     + c.gyro_noise * c.gyro_noise * lever
-                    + libm::pow(c.contact_velocity * looseness, 2.0);
+                    + square(c.contact_velocity * looseness);
                 let mut row = self.filter.contact_row(axis, &point, &speed, velocity);
                 let shaking = self.shakes[k].update(axis, row.residual, velocity, duration);
                 row.variance += shaking * (SHAKE_MEMORY_S / duration).max(1.0);
@@ -327,7 +327,7 @@ impl Estimator {
             }
             let turning_noise = c.velocity_noise * c.velocity_noise * legs.1 + c.gyro_noise * c.gyro_noise;
             for axis in 2..3 {
-                let variance = turning_noise + libm::pow(c.sole_rate * looseness, 2.0);
+                let variance = turning_noise + square(c.sole_rate * looseness);
                 let row = self.filter.sole_row(axis, &sole_rate, variance);
                 self.filter.take(&row);
             }
@@ -405,4 +405,8 @@ impl Estimator {
             self.feet[k].sole_twist_s = sole_b.inverse_transform_twist(&total);
         }
     }
+}
+
+fn square(x: f64) -> f64 {
+    x * x
 }

@@ -117,7 +117,7 @@ fn balance(g: f64, h: f64) -> f64 {
         (false, true) => 1.0 / h,
         (false, false) => 1.0,
     };
-    libm::exp2(libm::round(0.25 * libm::log2(ratio)))
+    libm::scalbn(1.0, (libm::ilogb(ratio) + 2).div_euclid(4))
 }
 
 /// The largest relative change of a state's own cost, and which state's.
