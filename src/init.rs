@@ -5,7 +5,7 @@
 //! | [`feet`], [`tip`] | soles and tips of feet from shapes |
 //! | [`posture`], [`feet_posture`], [`arm_posture`] | a posture on one sole, on several feet, bolted down |
 //! | [`gauss_newton`] | what solves for it |
-//! | [`files`], [`scenario_text`] | the texts of the two files |
+//! | [`files`], [`mod@scenario_text`] | the texts of the two files |
 //!
 //! What `init` writes runs as it is; the files are the user's from then on.
 
