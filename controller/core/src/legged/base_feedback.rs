@@ -1,13 +1,14 @@
 //! The base's part of the gain, told to a servo that has no base to read: by gyroscope and by the legs that stand.
 //!
-//! | letter | meaning |
-//! |---|---|
-//! | `θ`, `p` | deviation of the base: rotation, mass centre of the base body, both in its axes |
-//! | `ω`, `v` | deviation of its angular and linear velocity, in its axes |
-//! | `φ`, `ω_i` | deviation of the gyroscope's sum and of its rate, in the axes of the inertial unit |
-//! | `M`, `a_j` | axes of the inertial unit in those of the base; axes of the joints between the two |
-//! | `r`, `J = ∂r/∂q`, `J̇` | a standing foot from the base's mass centre, in the base's axes |
-//! | `s` | share of the feet in the weight, as planned, of those that are flat and felt to carry something |
+//! | letter | meaning | unit |
+//! |---|---|---|
+//! | `θ`, `p` | deviation of the base: rotation, mass centre of the base body, both in its axes | rad, m |
+//! | `ω`, `v` | deviation of its angular and linear velocity, in its axes; `ω₀`: angular velocity in the plan | rad/s, m/s |
+//! | `φ`, `ω_i` | deviation of the gyroscope's sum and of its rate, in the axes of the inertial unit | rad, rad/s |
+//! | `M`, `a_j` | axes of the inertial unit in those of the base; axes of the joints between the two | |
+//! | `r`, `J = ∂r/∂q`, `J̇` | a standing foot from the base's mass centre, in the base's axes | m, m/rad |
+//! | `s` | share of the feet in the weight, as planned, of those that are flat and felt to carry something; their sum is 1 | |
+//! | `K_θ`, `K_p`, `K_ω`, `K_v` | columns of the gain on the base, three each | N m per unit of the above |
 //!
 //! ```text
 //! θ = M φ - Σ_j a_j δq_j                          ω = M ω_i - Σ_j a_j δq̇_j + Σ_j a_j × (ω₀ + Σ_{k ≤ j} a_k q̇_k) δq_j
@@ -27,7 +28,7 @@ use delmpc_estimation::prelude::BaseEstimate;
 use delmpc_horizon::legged_model::LeggedModel;
 use delmpc_mechanics::contact_stage::BoundaryState;
 use delmpc_mechanics::errors::ModelError;
-use delmpc_mechanics::kinematics::{Configuration, Kinematics, Velocity};
+use delmpc_mechanics::kinematics::{Configuration, Kinematics, Velocity, base_pose_from_link};
 use delmpc_mechanics::spatial::{RigidTransform, Twist, log_rotation};
 use delmpc_mechanics::tree::KinematicTree;
 use delmpc_messages::{Command, MAX_JOINTS, MAX_SEGMENTS};
@@ -35,7 +36,7 @@ use faer::{Mat, MatRef};
 use nalgebra::{Matrix3, RowVector3, Vector3};
 
 /// Time over which turning and Jacobians are differenced, s.
-const MOMENT_S: f64 = 1e-3;
+pub(crate) const MOMENT_S: f64 = 1e-3;
 /// A stage whose feet carry less than this part of the weight tells nothing of the base's place.
 const LEAST_SHARE: f64 = 0.05;
 
@@ -68,6 +69,7 @@ pub(crate) struct BaseFeedback {
 }
 
 impl BaseFeedback {
+    /// For an inertial unit on `imu_body`, whose axes are the columns of `mounting` in that body's link axes. No gain yet.
     pub fn new(tree: &KinematicTree, imu_body: usize, mounting: Matrix3<f64>) -> Self {
         let joints = tree.joint_count();
         let branch = tree.branch(imu_body).iter().filter(|dof| **dof >= 6);
@@ -105,7 +107,8 @@ impl BaseFeedback {
         (0..6).map(|k| self.gain[(i, k)] * place[k] + self.gain[(i, 6 + k)] * velocity[k]).sum()
     }
 
-    /// How the inertial unit turns where segment `segment` begins, from the states there and [`BaseFeedback::MOMENT_S`] later.
+    /// How the inertial unit turns where segment `segment` begins, from the states there and [`MOMENT_S`] later. Two passes over the
+    /// tree, no allocation.
     ///
     /// # Errors
     /// [`ModelError::Length`] for a state of another robot.
@@ -122,9 +125,6 @@ impl BaseFeedback {
         Ok(())
     }
 
-    /// The moment of [`BaseFeedback::take_turning`].
-    pub const MOMENT_S: f64 = MOMENT_S;
-
     fn turning(
         &mut self,
         tree: &KinematicTree,
@@ -139,8 +139,9 @@ impl BaseFeedback {
     }
 
     /// Tells the gain: adds to those on the joints, sets those on the inertial unit and its reference. `start` is the state at which
-    /// the command begins, `shares` the feet's parts of the weight, `angle` the gyroscope's sum and `measured` the base at the
-    /// measurement, `q` the joints there, `since_s` the time from there to the command's begin.
+    /// the command begins, `shares` the feet's parts of the weight (one each, 0: it tells nothing), `angle` the gyroscope's sum (rad)
+    /// and `measured` the base at the measurement, `q` the joints there, `since_s` the time from there to the command's begin. Three
+    /// passes over the tree and O(n²), no allocation.
     ///
     /// # Errors
     /// [`ModelError::Length`] for a state of another robot.
@@ -155,7 +156,7 @@ impl BaseFeedback {
         command: &mut Command,
     ) -> Result<(), ModelError> {
         let tree = &model.tree;
-        let pose = delmpc_mechanics::kinematics::base_pose_from_link(tree, &measured.base_link_pose_w);
+        let pose = base_pose_from_link(tree, &measured.base_link_pose_w);
         self.kinematics.update_positions(tree, &Configuration::floating(pose, q))?;
         let measured_w = self.kinematics.link_poses_w()[self.imu_body].rotation * self.mounting;
         let segments = command.n_segments as usize;
@@ -167,7 +168,7 @@ impl BaseFeedback {
             out.imu_acceleration_ref = turning.acceleration.into();
         }
         command.imu_rate_bias = measured.gyro_bias.into();
-        let (from_base, to_base) = self.stand_on(model, start, shares)?;
+        let (from_base, to_base) = self.lever_of_standing_feet(model, start, shares)?;
         let row = |i: usize, first: usize| {
             RowVector3::new(self.gain[(i, first)], self.gain[(i, first + 1)], self.gain[(i, first + 2)])
         };
@@ -196,7 +197,7 @@ impl BaseFeedback {
 
     /// The mean of the standing feet from the base, `None` when none stands, and the axes of the inertial unit, in the base's axes;
     /// the Jacobians and the axes of the chain along with them.
-    fn stand_on(
+    fn lever_of_standing_feet(
         &mut self,
         model: &LeggedModel,
         start: &BoundaryState,

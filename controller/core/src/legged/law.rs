@@ -3,7 +3,7 @@
 use delmpc_messages::{Command, FallbackLevel, LARGEST_EFFORT, MAX_FEET, MAX_JOINTS, PlantState};
 
 use super::LeggedController;
-use super::base_feedback::BaseFeedback;
+use super::base_feedback::MOMENT_S;
 use crate::config::ControllerKind;
 use crate::feedback_law::{LawSegment, write_law};
 use crate::telling::state_estimate;
@@ -124,7 +124,7 @@ impl LeggedController {
             for j in 0..joints {
                 segment.acceleration[j] = (segment.acceleration[j] - scratch.rate[j]) / length_s;
             }
-            plan.state_at(from_s + BaseFeedback::MOMENT_S, later);
+            plan.state_at(from_s + MOMENT_S, later);
             // Never an error for states of this model; without its turning a segment has the last one's.
             let _ = base_feedback.take_turning(&robot.model.tree, segments, scratch, later);
             segments += 1;
