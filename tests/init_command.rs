@@ -3,31 +3,19 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
-use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::path::PathBuf;
+mod made_up;
 
-const PROGRAM: &str = env!("CARGO_BIN_EXE_delmpc");
+use made_up::delmpc;
 
 /// A link: mass, where its mass centre is below its joint, what it collides with.
 fn link(text: &mut String, name: &str, mass: f64, below: f64, shape: &str) {
-    let inertia = 0.004 * mass;
-    let _ = writeln!(
-        text,
-        "<link name='{name}'><inertial><origin xyz='0 0 {}'/><mass value='{mass}'/>\
-         <inertia ixx='{inertia}' ixy='0' ixz='0' iyy='{inertia}' iyz='0' izz='{inertia}'/></inertial>{shape}</link>",
-        -below
-    );
+    made_up::link(text, name, mass, below, 0.004 * mass, shape);
 }
 
 /// A joint: parent, child, place, axis, range, effort.
 fn joint(text: &mut String, ends: [&str; 2], at: [f64; 3], axis: &str, range: [f64; 2], effort: f64) {
-    let ([parent, child], [x, y, z], [lower, upper]) = (ends, at, range);
-    let _ = writeln!(
-        text,
-        "<joint name='{child}_joint' type='revolute'><origin xyz='{x} {y} {z}'/><parent link='{parent}'/><child link='{child}'/>\
-         <axis xyz='{axis}'/><limit lower='{lower}' upper='{upper}' effort='{effort}' velocity='12'/></joint>"
-    );
+    made_up::joint(text, ends, at, axis, range, [effort, 12.0]);
 }
 
 /// The biped, 1 m tall; `foot` is what its feet collide with.
@@ -68,18 +56,7 @@ const BOX: &str =
     "<collision><origin xyz='0.03 0 -0.04'/><geometry><box size='0.2 0.09 0.02'/></geometry></collision>";
 
 fn folder(name: &str, urdf: &str) -> PathBuf {
-    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("init-{name}"));
-    let _ = std::fs::remove_dir_all(&folder);
-    std::fs::create_dir_all(&folder).unwrap();
-    std::fs::write(folder.join("mini.urdf"), urdf).unwrap();
-    folder
-}
-
-/// Exit status, standard output and standard error.
-fn delmpc(folder: &Path, arguments: &[&str]) -> (Option<i32>, String, String) {
-    let output = Command::new(PROGRAM).args(arguments).current_dir(folder).output().unwrap();
-    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
-    (output.status.code(), text(output.stdout), text(output.stderr))
+    made_up::folder(&format!("init-{name}"), "mini.urdf", urdf)
 }
 
 #[test]

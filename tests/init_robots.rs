@@ -2,30 +2,18 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
-use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+mod made_up;
 
-const PROGRAM: &str = env!("CARGO_BIN_EXE_delmpc");
+use made_up::delmpc;
 
 /// A link of a mass whose centre is so far below (above: negative) its joint, with a shape.
 fn link(text: &mut String, name: &str, mass: f64, below: f64, size: f64, shape: &str) {
-    let inertia = mass * size * size / 12.0;
-    let _ = writeln!(
-        text,
-        "<link name='{name}'><inertial><origin xyz='0 0 {}'/><mass value='{mass}'/>\
-         <inertia ixx='{inertia}' ixy='0' ixz='0' iyy='{inertia}' iyz='0' izz='{inertia}'/></inertial>{shape}</link>",
-        -below
-    );
+    made_up::link(text, name, mass, below, mass * size * size / 12.0, shape);
 }
 
 fn joint(text: &mut String, ends: [&str; 2], at: [f64; 3], axis: &str, range: [f64; 2], effort: f64) {
-    let ([parent, child], [x, y, z], [lower, upper]) = (ends, at, range);
-    let _ = writeln!(
-        text,
-        "<joint name='{child}_joint' type='revolute'><origin xyz='{x} {y} {z}'/><parent link='{parent}'/><child link='{child}'/>\
-         <axis xyz='{axis}'/><limit lower='{lower}' upper='{upper}' effort='{effort}' velocity='15'/></joint>"
-    );
+    made_up::joint(text, ends, at, axis, range, [effort, 15.0]);
 }
 
 /// A dog of 12 kg with legs of 0.4 m; `foot` is what the shanks collide with, `range` that of the knees.
@@ -73,18 +61,7 @@ fn arm() -> String {
 }
 
 fn folder(name: &str, urdf: &str) -> PathBuf {
-    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("init-robots-{name}"));
-    let _ = std::fs::remove_dir_all(&folder);
-    std::fs::create_dir_all(&folder).unwrap();
-    std::fs::write(folder.join("it.urdf"), urdf).unwrap();
-    folder
-}
-
-/// Exit status, standard output and standard error.
-fn delmpc(folder: &Path, arguments: &[&str]) -> (Option<i32>, String, String) {
-    let output = Command::new(PROGRAM).args(arguments).current_dir(folder).output().unwrap();
-    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
-    (output.status.code(), text(output.stdout), text(output.stderr))
+    made_up::folder(&format!("init-robots-{name}"), "it.urdf", urdf)
 }
 
 /// A run in lockstep that has to end well.
