@@ -16,6 +16,7 @@ use delmpc_mechanics::prelude::RigidTransform;
 use delmpc_scenario::{ControllerKind, GaitKind, GaitSettings};
 use nalgebra::Vector3;
 
+use crate::planned_walk::planned_walk;
 use crate::robot_controller::{constraints, estimator_config, estimator_model, joint_limits};
 use crate::setup::Setup;
 
@@ -151,6 +152,10 @@ fn motion(setup: &Setup, model: &LeggedModel, height: f64) -> Result<Motion, Str
             stop_s: gait.stop_s,
             ramp_s: gait.ramp_s,
         }));
+    }
+    if let Some(plan) = &setup.plan {
+        let (base, steps) = planned_walk(plan, setup)?;
+        return Ok(Motion::Planned(base, steps));
     }
     if scenario.step.is_empty() {
         return Ok(Motion::Stand);

@@ -72,6 +72,7 @@ pub mod plan;
 pub mod plan_page;
 pub mod plan_source;
 pub mod plan_task;
+pub mod planned_walk;
 pub mod plant;
 pub mod plant_process;
 pub mod push_map;

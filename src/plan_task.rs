@@ -58,9 +58,12 @@ pub fn task_of(
         speed_m_s: (settings.start_speed_m_s, settings.end_speed_m_s),
         start,
         friction: settings.friction,
+        sliding: settings.sliding,
+        range_margin: settings.range_margin,
         torque_fraction: settings.torque_fraction,
         torque_limit_nm: settings.torque_limit_nm,
         rate_limit: settings.rate_limit_rad_s,
+        rate_fraction: settings.rate_fraction,
         bounds,
         base: BaseBounds {
             attitude_rad: settings.base_attitude_rad,

@@ -158,7 +158,9 @@ impl Setup {
     /// Whether the robot stands on several feet, or goes: then its controller has a contact schedule.
     pub fn is_legged(&self) -> bool {
         let scenario = &self.scenario;
-        scenario.robot.stance.names().len() > 1 || scenario.gait.is_some() || !scenario.step.is_empty()
+        let goes = scenario.gait.is_some() || !scenario.step.is_empty();
+        let planned = scenario.plan.as_ref().is_some_and(|plan| plan.hand.is_empty());
+        scenario.robot.stance.names().len() > 1 || goes || planned
     }
 
     /// Index of the (first) stance foot among the soles of the robot.

@@ -101,7 +101,7 @@ pub fn slope(scenario: &Scenario) -> Matrix3<f64> {
 }
 
 /// The same origin and heading, z up.
-fn levelled(sole: &RigidTransform) -> RigidTransform {
+pub fn levelled(sole: &RigidTransform) -> RigidTransform {
     let forward: Vector3<f64> = sole.rotation.column(0).into();
     let heading = forward.y.atan2(forward.x);
     RigidTransform { rotation: exp_rotation(&Vector3::new(0.0, 0.0, heading)), translation: sole.translation }

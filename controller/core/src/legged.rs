@@ -305,6 +305,12 @@ impl LeggedController {
                 };
                 self.walk = Some(GaitWalk::new(command.gait.clone(), aim.path, &places));
             }
+            Motion::Planned(base, steps) => {
+                if !lay_out(steps, &mut self.schedule) {
+                    return Err(ControlError::Model { reason: "the planned steps do not fit one after the other" });
+                }
+                aim.planned = Some(base.clone());
+            }
             Motion::Steps(steps) => {
                 if !lay_out(steps, &mut self.schedule) {
                     return Err(ControlError::Model { reason: "the steps do not fit one after the other" });

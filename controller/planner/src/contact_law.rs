@@ -10,6 +10,9 @@
 //! or lift-off inside a stage is impossible at κ = 0 and the solver moves the stage boundaries onto the events.
 //! `τ·s + μ n γ` is the duality gap of maximum dissipation: friction without a polyhedron. Restitution 0.
 //!
+//! A plan whose feet shall not slide has `μ (n^0 + n^½)(γ^0 + γ^½) + μ n^1 γ^1` in its place: a point that carries stays where it is
+//! through its stage, whatever the friction in its cone.
+//!
 //! An optional row bounds the speed of approach at the end of the stage, before an impact, the less the higher the point is:
 //! `φ^0 - 4 φ^½ + 3 φ^1 + v_max Δt + 4 φ^1 >= 0`.
 //!
@@ -45,6 +48,8 @@ pub struct LawConstants {
     pub tangents: usize,
     /// Coefficient of friction.
     pub friction: f64,
+    /// Whether a point that carries may slide.
+    pub sliding: bool,
     /// `c = T/2N`, s.
     pub half_stage_s: f64,
     /// Largest speed of approach before an impact, m/s; none without the row.
@@ -244,7 +249,9 @@ impl<'a> Evaluation<'a> {
             for t in 0..law.tangents {
                 let tau = x[law.tangential(node) + t];
                 let (slip, _) = self.slip(node, t);
-                product += tau * slip;
+                if law.sliding {
+                    product += tau * slip;
+                }
                 tau2 += tau * tau;
                 slip2 += slip * slip;
                 if law.tangents == 1 {
@@ -258,7 +265,12 @@ impl<'a> Evaluation<'a> {
                 out.value[3 + node] = law.friction * n - soft_length(tau2, self.softness[0]);
                 out.value[6 + node] = bound - soft_length(slip2, self.softness[1]);
             }
-            product += law.friction * n * bound;
+            if law.sliding || node == 2 {
+                product += law.friction * n * bound;
+            }
+        }
+        if !law.sliding {
+            product += law.friction * (n0 + n1) * (x[law.slip(0)] + x[law.slip(1)]);
         }
         out.product = product;
         out.value[law.product_row()] = homotopy.kappa - product;
@@ -373,10 +385,17 @@ impl<'a> Evaluation<'a> {
                 both(n, height, l * factor);
                 both(n, along, l * factor * slope);
             }
-            let (n, bound) = (law.normal(node), law.slip(node));
-            g[n] -= law.friction * x[bound];
-            g[bound] -= law.friction * x[n];
-            both(n, bound, l * law.friction);
+            let n = law.normal(node);
+            // A point that carries at the start or in the middle of its stage does not slide in either half.
+            let bounds = if law.sliding || node == 2 { node..node + 1 } else { 0..2 };
+            for bound in bounds.map(|node| law.slip(node)) {
+                g[n] -= law.friction * x[bound];
+                g[bound] -= law.friction * x[n];
+                both(n, bound, l * law.friction);
+            }
+            if !law.sliding {
+                continue;
+            }
             for t in 0..law.tangents {
                 let tau = law.tangential(node) + t;
                 let (slip, parts) = self.slip(node, t);
@@ -451,8 +470,8 @@ mod tests {
             ..Terrain::flat()
         };
         for tangents in [1, 2] {
-            for touchdown_speed in [None, Some(1.5)] {
-                let law = LawConstants { tangents, friction: 0.7, half_stage_s: 0.04, touchdown_speed };
+            for (touchdown_speed, sliding) in [(None, true), (Some(1.5), true), (None, false)] {
+                let law = LawConstants { tangents, friction: 0.7, sliding, half_stage_s: 0.04, touchdown_speed };
                 check(law, &terrain);
                 check(law, &Terrain::flat());
             }

@@ -100,6 +100,8 @@ pub struct Blueprint {
     pub terrain: Terrain,
     /// Coefficient of friction.
     pub friction: f64,
+    /// Whether a point that carries may slide.
+    pub sliding: bool,
     /// Stages.
     pub stages: usize,
     /// Length of the motion, s.
@@ -118,7 +120,7 @@ impl Problem {
     /// # Errors
     /// [`PlanError`] for a robot that the node recursions do not handle or numbers out of range.
     pub fn new(blueprint: Blueprint) -> Result<Self, PlanError> {
-        let Blueprint { robot, terrain, friction, stages, horizon_s, clearance, touchdown_speed, standing } =
+        let Blueprint { robot, terrain, friction, sliding, stages, horizon_s, clearance, touchdown_speed, standing } =
             blueprint;
         if stages < 2 {
             return Err(PlanError::OutOfRange {
@@ -134,6 +136,7 @@ impl Problem {
         let law = LawConstants {
             tangents: if robot.planar { 1 } else { 2 },
             friction,
+            sliding,
             half_stage_s: 0.5 * horizon_s / stages as f64,
             touchdown_speed,
         };

@@ -109,12 +109,18 @@ pub struct Task {
     pub start: Vec<f64>,
     /// Coefficient of friction that the plan may use.
     pub friction: f64,
+    /// Whether a foot that carries may slide.
+    pub sliding: bool,
+    /// Part of the joints' ranges that is kept free at either end.
+    pub range_margin: f64,
     /// Part of the torque limits that the plan may use.
     pub torque_fraction: f64,
     /// Torque limit of joints without one, N m.
     pub torque_limit_nm: f64,
     /// Rate limit of driven joints without one, rad/s.
     pub rate_limit: f64,
+    /// Part of the rate limits that the plan may use.
+    pub rate_fraction: f64,
     /// Bounds of single coordinates besides the robot's limits: coordinate, lowest, highest.
     pub bounds: Vec<(usize, f64, f64)>,
     /// Bounds of the base.
@@ -159,6 +165,7 @@ impl Task {
             robot,
             terrain: self.terrain.clone(),
             friction: self.friction,
+            sliding: self.sliding,
             stages: self.stages,
             horizon_s: self.horizon_s,
             clearance: self.clearance.clone(),
@@ -210,7 +217,11 @@ impl Task {
         for j in 0..robot.dof() {
             let limits = &robot.limits[j];
             if j >= robot.base_coordinates {
-                problem.bound_position(j, limits.lower, limits.upper);
+                let range = limits.upper - limits.lower;
+                let margin = if range.is_finite() { self.range_margin * range } else { 0.0 };
+                // A start beyond the margin may stay, not go further.
+                let (lower, upper) = (limits.lower + margin, limits.upper - margin);
+                problem.bound_position(j, lower.min(self.start[j]), upper.max(self.start[j]));
             }
             let name = robot.coordinates[j].as_str();
             match name {
@@ -227,7 +238,7 @@ impl Task {
         for (input, &j) in robot.actuated.iter().enumerate() {
             let limits = &robot.limits[j];
             let rate = if limits.velocity.is_finite() { limits.velocity } else { self.rate_limit };
-            problem.bound_rate(j, rate);
+            problem.bound_rate(j, self.rate_fraction * rate);
             let effort = if limits.effort.is_finite() { limits.effort } else { self.torque_limit_nm };
             problem.bound_input(input, self.torque_fraction * effort);
         }

@@ -41,6 +41,7 @@ pub mod load_sharing;
 pub mod mass_centre_plan;
 pub mod motion_plan;
 pub mod motion_reference;
+pub mod planned_base;
 pub mod retiming;
 pub mod stage_grid;
 pub mod step_plan;

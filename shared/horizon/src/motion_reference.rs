@@ -25,6 +25,7 @@ use crate::leg_kinematics::LegKinematics;
 use crate::legged_model::LeggedModel;
 use crate::load_sharing::{Share, share_load};
 use crate::mass_centre_plan::MassCentrePlan;
+use crate::planned_base::PlannedBase;
 use crate::stage_grid::StageGrid;
 
 /// Iterations of the inverse kinematics at a boundary, and rounds in which the base follows the mass centre.
@@ -53,6 +54,8 @@ pub struct Aim {
     pub path: BasePath,
     /// The way of the mass centre in a walk.
     pub mass_centre: Option<MassCentrePlan>,
+    /// Base and mass centre as planned through contact: they replace path, mass centre and height; the ground moves them up and down.
+    pub planned: Option<PlannedBase>,
     /// Height of the mass centre, m.
     pub height_m: f64,
     /// It goes down by this before the first step, so that no leg has to stretch, m ...
@@ -71,6 +74,11 @@ impl Aim {
 
     /// Place, velocity and acceleration of the mass centre at a time.
     pub fn mass_centre_at(&self, time_s: f64) -> [Vector3<f64>; 3] {
+        if let Some(planned) = &self.planned {
+            let [mut place, velocity, acceleration] = planned.at(time_s).mass_centre_w;
+            place.z += self.height_m - planned.begin().mass_centre_w.z;
+            return [place, velocity, acceleration];
+        }
         let [place, velocity, acceleration] = match &self.mass_centre {
             Some(plan) => plan.at(time_s),
             None => {
@@ -89,6 +97,19 @@ impl Aim {
             with_height(&velocity, gradient.dot(&velocity) - self.crouch_m * speed),
             with_height(&acceleration, -self.crouch_m * change),
         ]
+    }
+}
+
+impl Aim {
+    /// Orientation of the base at a time, and its angular velocity in its axes; `upright`: orientation at home without its heading.
+    fn orientation_at(&self, time_s: f64, upright: &Matrix3<f64>) -> (Matrix3<f64>, Vector3<f64>) {
+        if let Some(planned) = &self.planned {
+            let point = planned.at(time_s);
+            return (point.orientation, point.spin_b);
+        }
+        let point = self.path.at(time_s);
+        let orientation = rotation_z(point.yaw) * upright;
+        (orientation, orientation.tr_mul(&Vector3::new(0.0, 0.0, point.yaw_rate)))
     }
 }
 
@@ -182,6 +203,7 @@ impl MotionReference {
         let aim = Aim {
             path: BasePath::still(middle.xy() + offset, yaw + turned),
             mass_centre: None,
+            planned: None,
             height_m: middle.z + mass_centre.z - middle_home.z,
             crouch_m: 0.0,
             crouched_s: 0.0,
@@ -223,7 +245,7 @@ impl MotionReference {
     ) -> Result<(), HorizonError> {
         self.kinematics.update(&model.tree, state)?;
         let [place, ..] = self.aim.mass_centre_at(time_s);
-        let aimed = rotation_z(self.aim.path.at(time_s).yaw) * self.upright;
+        let (aimed, _) = self.aim.orientation_at(time_s, &self.upright);
         self.begin = Begin {
             time_s,
             turn: log_rotation(&aimed.tr_mul(&state.orientation)),
@@ -316,14 +338,13 @@ impl MotionReference {
     ) -> Result<(), StepError> {
         let Self { aim, swing, legs, targets, upright, to_mass_centre, begin, .. } = self;
         let target = &mut targets[k];
-        let point = aim.path.at(time_s);
-        let turn = rotation_z(point.yaw);
+        let (aimed, spin) = aim.orientation_at(time_s, upright);
         let [place, velocity, _] = aim.mass_centre_at(time_s);
         let left = begin.left(time_s);
         let place = place + begin.way * left;
         (target.mass_centre_w, target.mass_centre_velocity_w) = (place, velocity);
-        target.state.orientation = turn * *upright * exp_rotation(&(begin.turn * left));
-        target.state.position_w = place - turn * *to_mass_centre;
+        target.state.orientation = aimed * exp_rotation(&(begin.turn * left));
+        target.state.position_w = place - aimed * upright.tr_mul(to_mass_centre);
         for (foot, out) in target.feet.iter_mut().enumerate() {
             // At its touchdown a foot is still where its swing ends.
             *out = match schedule.phase(foot, time_s - BEFORE_S) {
@@ -336,7 +357,7 @@ impl MotionReference {
             legs.solve(model, &pose, &target.feet, &mut target.state.q, ITERATIONS)?;
             target.state.position_w += place - legs.mass_centre_w(model);
         }
-        let spin = target.state.orientation.tr_mul(&Vector3::new(0.0, 0.0, point.yaw_rate));
+        let spin = exp_rotation(&(begin.turn * left)).tr_mul(&spin);
         let linear = target.state.orientation.tr_mul(&velocity);
         target.state.base_velocity_b = Vector6::new(spin.x, spin.y, spin.z, linear.x, linear.y, linear.z);
         Ok(())

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PlanSettings {
-    /// Plan that a run follows, relative to the scenario file; empty: none.
+    /// Plan that a run follows, relative to the scenario file; empty: planned on first use, and kept in `runs/plans`.
     pub file: String,
     /// Length of the motion, s.
     pub horizon_s: f64,
@@ -27,12 +27,18 @@ pub struct PlanSettings {
     pub end_speed_m_s: f64,
     /// Coefficient of friction that the plan counts on.
     pub friction: f64,
+    /// Whether a foot that carries may slide, against full friction.
+    pub sliding: bool,
+    /// Part of the joints' ranges that the plan keeps free at either end.
+    pub range_margin: f64,
     /// Part of the torque limits that the plan may use.
     pub torque_fraction: f64,
     /// Torque limit of joints for which the URDF has none, N m.
     pub torque_limit_nm: f64,
     /// Rate limit of joints for which the URDF has none, rad/s.
     pub rate_limit_rad_s: f64,
+    /// Part of the rate limits that the plan may use.
+    pub rate_fraction: f64,
     /// Largest pitch, roll and yaw of the base, rad.
     pub base_attitude_rad: f64,
     /// Lowest and highest position of the base, m.
@@ -201,9 +207,12 @@ impl Default for PlanSettings {
             start_speed_m_s: 0.0,
             end_speed_m_s: 0.0,
             friction: 0.5,
+            sliding: true,
+            range_margin: 0.0,
             torque_fraction: 0.75,
             torque_limit_nm: 60.0,
             rate_limit_rad_s: 15.0,
+            rate_fraction: 1.0,
             base_attitude_rad: 0.8,
             base_height_m: [0.0, 10.0],
             guess_lift_m: 0.05,
@@ -254,6 +263,8 @@ impl PlanSettings {
             ("plan.start_speed_m_s", self.start_speed_m_s, -10.0, 10.0),
             ("plan.end_speed_m_s", self.end_speed_m_s, -10.0, 10.0),
             ("plan.friction", self.friction, 0.01, 10.0),
+            ("plan.rate_fraction", self.rate_fraction, 0.01, 1.0),
+            ("plan.range_margin", self.range_margin, 0.0, 0.4),
             ("plan.torque_fraction", self.torque_fraction, 0.01, 1.0),
             ("plan.torque_limit_nm", self.torque_limit_nm, 1e-3, 1e6),
             ("plan.rate_limit_rad_s", self.rate_limit_rad_s, 1e-2, 1e4),

@@ -7,6 +7,7 @@ use delmpc_horizon::gait::Gait;
 use delmpc_horizon::legged_model::LeggedModel;
 use delmpc_horizon::legged_tasks::LeggedWeights;
 use delmpc_horizon::motion_reference::SwingShape;
+use delmpc_horizon::planned_base::PlannedBase;
 use delmpc_horizon::step_plan::Step;
 use delmpc_lq::projected_qp::ProjectedQpOptions;
 
@@ -22,6 +23,8 @@ pub enum Motion {
     Gait(GaitCommand),
     /// Go by single steps, in the order of time.
     Steps(Vec<Step>),
+    /// Go as planned through contact: base and mass centre, and the steps in the order of time.
+    Planned(PlannedBase, Vec<Step>),
 }
 
 /// A gait and the way.

@@ -1,0 +1,142 @@
+//! The motion of base and mass centre as a plan has it: read at any time between its boundaries.
+//!
+//! ```text
+//! c(t)   cubic Hermite polynomial of mass centre and its velocity at both ends, error O(Δt⁴)
+//! R(t) = R_a exp(r(t))   r: the same through 0 and log(R_aᵀ R_b), with the spins at both ends (body axes) as its rates
+//! ```
+//!
+//! The rate of `r` is the spin but for a term of the order of `r` times it, which is small between two boundaries of a plan.
+
+use alloc::vec::Vec;
+
+use delmpc_mechanics::spatial::{exp_rotation, log_rotation};
+use nalgebra::{Matrix3, Vector3};
+
+/// Base and mass centre at a boundary of the plan.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BaseNode {
+    /// Time, s.
+    pub time_s: f64,
+    /// Mass centre, m.
+    pub mass_centre_w: Vector3<f64>,
+    /// Its velocity, m/s.
+    pub mass_centre_velocity_w: Vector3<f64>,
+    /// Orientation of the base, from its axes to those of the world.
+    pub orientation: Matrix3<f64>,
+    /// Angular velocity of the base in its axes, rad/s.
+    pub spin_b: Vector3<f64>,
+}
+
+/// Base and mass centre at a time.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BasePoint {
+    /// Place, velocity and acceleration of the mass centre, m.
+    pub mass_centre_w: [Vector3<f64>; 3],
+    /// Orientation of the base.
+    pub orientation: Matrix3<f64>,
+    /// Angular velocity in its axes, rad/s.
+    pub spin_b: Vector3<f64>,
+}
+
+/// The motion; at rest before and after.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PlannedBase {
+    nodes: Vec<BaseNode>,
+}
+
+impl PlannedBase {
+    /// Of two or more boundaries whose times rise; `None` else.
+    pub fn new(nodes: Vec<BaseNode>) -> Option<Self> {
+        let rises = nodes.windows(2).all(|pair| pair[1].time_s - pair[0].time_s > 1e-6);
+        (nodes.len() >= 2 && rises).then_some(Self { nodes })
+    }
+
+    /// The first boundary.
+    pub fn begin(&self) -> &BaseNode {
+        &self.nodes[0]
+    }
+
+    /// The last boundary.
+    pub fn end(&self) -> &BaseNode {
+        &self.nodes[self.nodes.len() - 1]
+    }
+
+    /// Base and mass centre at a time (s). No allocation.
+    pub fn at(&self, time_s: f64) -> BasePoint {
+        let resting = |node: &BaseNode| BasePoint {
+            mass_centre_w: [node.mass_centre_w, Vector3::zeros(), Vector3::zeros()],
+            orientation: node.orientation,
+            spin_b: Vector3::zeros(),
+        };
+        let after = self.nodes.partition_point(|node| node.time_s <= time_s);
+        let (Some(a), Some(b)) = (after.checked_sub(1).map(|k| &self.nodes[k]), self.nodes.get(after)) else {
+            return resting(if after == 0 { self.begin() } else { self.end() });
+        };
+        let length = b.time_s - a.time_s;
+        let t = (time_s - a.time_s) / length;
+        let turn = log_rotation(&a.orientation.tr_mul(&b.orientation));
+        let [angle, spin, _] = hermite(t, length, [&Vector3::zeros(), &a.spin_b, &turn, &b.spin_b]);
+        let ends = [&a.mass_centre_w, &a.mass_centre_velocity_w, &b.mass_centre_w, &b.mass_centre_velocity_w];
+        BasePoint {
+            mass_centre_w: hermite(t, length, ends),
+            orientation: a.orientation * exp_rotation(&angle),
+            spin_b: spin,
+        }
+    }
+}
+
+/// Value, rate and change of rate at the part `t` of `length` seconds, from value and rate at both ends.
+fn hermite(t: f64, length: f64, [p, v, q, w]: [&Vector3<f64>; 4]) -> [Vector3<f64>; 3] {
+    let (t2, t3) = (t * t, t * t * t);
+    let value = p * (1.0 - 3.0 * t2 + 2.0 * t3)
+        + q * (3.0 * t2 - 2.0 * t3)
+        + (v * (t - 2.0 * t2 + t3) + w * (t3 - t2)) * length;
+    let rate = (p - q) * (6.0 * (t2 - t) / length) + v * (1.0 - 4.0 * t + 3.0 * t2) + w * (3.0 * t2 - 2.0 * t);
+    let change =
+        (p - q) * ((12.0 * t - 6.0) / (length * length)) + (v * (6.0 * t - 4.0) + w * (6.0 * t - 2.0)) / length;
+    [value, rate, change]
+}
+
+#[cfg(test)]
+mod tests {
+    use alloc::vec;
+
+    use super::*;
+
+    fn node(t: f64) -> BaseNode {
+        let axis = Vector3::new(0.1, -0.2, 0.3);
+        BaseNode {
+            time_s: t,
+            mass_centre_w: Vector3::new(t * t * t, 1.0 - t, 0.2),
+            mass_centre_velocity_w: Vector3::new(3.0 * t * t, -1.0, 0.0),
+            orientation: exp_rotation(&(axis * t)),
+            spin_b: axis,
+        }
+    }
+
+    #[test]
+    fn a_cubic_way_and_an_even_turn_are_followed_exactly() {
+        let planned = PlannedBase::new(vec![node(1.0), node(1.3), node(2.0)]).unwrap();
+        for t in [1.0, 1.1, 1.3, 1.77] {
+            let (point, exact) = (planned.at(t), node(t));
+            let [place, velocity, acceleration] = point.mass_centre_w;
+            assert!((place - exact.mass_centre_w).norm() < 1e-14, "{t}");
+            assert!((velocity - exact.mass_centre_velocity_w).norm() < 1e-13, "{t}");
+            assert!((acceleration - Vector3::new(6.0 * t, 0.0, 0.0)).norm() < 1e-12, "{t}");
+            assert!((point.orientation - exact.orientation).norm() < 1e-14, "{t}");
+            assert!((point.spin_b - exact.spin_b).norm() < 1e-13, "{t}");
+        }
+    }
+
+    #[test]
+    fn it_rests_before_and_after_and_times_rise() {
+        let planned = PlannedBase::new(vec![node(1.0), node(2.0)]).unwrap();
+        for (t, end) in [(0.0, 1.0), (2.5, 2.0)] {
+            let point = planned.at(t);
+            assert_eq!(point.mass_centre_w, [node(end).mass_centre_w, Vector3::zeros(), Vector3::zeros()]);
+            assert_eq!(point.spin_b, Vector3::zeros());
+        }
+        assert!(PlannedBase::new(vec![node(1.0)]).is_none());
+        assert!(PlannedBase::new(vec![node(1.0), node(1.0)]).is_none());
+    }
+}
