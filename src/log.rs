@@ -6,9 +6,10 @@
 //!
 //! Beside them, in JSON, what makes viewers show the robot: [`crate::log_viewer`]. Scenario and robot are attached as files.
 //!
-//! The loop only copies records into a ring of memory that is there before the run ([`crate::log_queue`]). A thread of ordinary priority
-//! writes them ([`crate::log_file`]), so that a killed process loses what is younger than 50 ms. When the thread cannot keep up for seconds,
-//! records are refused and counted in real time, and waited for in lockstep. Messages are numbered by the loop: what is missing shows.
+//! The loop only copies records into a ring of memory that is there before the run ([`crate::log_queue`]). A thread of its own writes
+//! them ([`crate::log_file`]), so that a killed process loses what is younger than 50 ms: in real time it goes before ordinary programs,
+//! which would keep it from the cores for longer than that, and after plant and controller. When it cannot keep up for seconds, records are
+//! refused and counted in real time, and waited for in lockstep. Messages are numbered by the loop: what is missing shows.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -16,6 +17,7 @@ use std::path::Path;
 use std::thread::JoinHandle;
 
 use bytemuck::bytes_of;
+use delmpc_controller_process::machine::go_before_ordinary_programs;
 use delmpc_messages::{Command, PlantState};
 
 use crate::log_command;
@@ -78,13 +80,14 @@ pub struct Log {
 }
 
 impl Log {
-    /// Opens the file and starts the writer. `waits`: when the ring is full, wait, do not drop.
+    /// Opens the file and starts the writer. `waits`: when the ring is full, wait, do not drop. `first`: the writer goes before ordinary
+    /// programs, where that is permitted.
     ///
-    /// Make it before raising the priority: the writer is an ordinary thread.
+    /// Make it before raising the priority: the writer would inherit it.
     ///
     /// # Errors
     /// When the file cannot be made.
-    pub fn create(path: &Path, head: LogHead, waits: bool) -> Result<Self, Failure> {
+    pub fn create(path: &Path, head: LogHead, waits: bool, first: bool) -> Result<Self, Failure> {
         let cannot = |error: io::Error| Failure::Fault(format!("{}: {error}", path.display()));
         let room = if waits { LOCKSTEP_RING } else { REALTIME_RING };
         let (sender, receiver) = queue(room).map_err(|error| {
@@ -94,7 +97,12 @@ impl Log {
         let viewer = head.viewer;
         let writer = std::thread::Builder::new()
             .name("log".to_owned())
-            .spawn(move || write_all(file, channels, viewer, receiver))
+            .spawn(move || {
+                if first {
+                    go_before_ordinary_programs();
+                }
+                write_all(file, channels, viewer, receiver)
+            })
             .map_err(cannot)?;
         Ok(Self {
             sender: Some(sender),
@@ -445,6 +453,7 @@ mod tests {
                 &path,
                 LogHead { about: [("seed".into(), "1".into())].into(), ..LogHead::default() },
                 true,
+                false,
             )
             .unwrap();
             for k in 0..3000 {
