@@ -29,7 +29,8 @@ use crate::verdict::{Ended, Failure};
 pub fn controller(arguments: &ControllerArguments, allocations: fn() -> u64) -> Result<Ended, Failure> {
     let ControllerArguments { part: arguments, board } = arguments;
     let supervisor = Supervisor::of(arguments);
-    let setup = Setup::read(&arguments.scenario, &arguments.set)?;
+    let mut setup = Setup::read(&arguments.scenario, &arguments.set)?;
+    crate::plan_source::provide(&mut setup, true)?;
     let run = run_id(arguments, &setup)?;
     let process = ControllerProcess { arguments, setup: &setup, run, supervisor, allocations };
     if let Some(address) = board {

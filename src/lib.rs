@@ -71,6 +71,8 @@ pub mod output_file;
 pub mod part;
 pub mod plan;
 pub mod plan_page;
+pub mod plan_source;
+pub mod plan_task;
 pub mod plant;
 pub mod plant_process;
 pub mod push_map;

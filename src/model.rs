@@ -98,7 +98,7 @@ fn emit(arguments: &ModelArguments) -> Result<String, Failure> {
             let sole = robot.soles.first().ok_or_else(|| missing("sole"))?;
             scenario.robot.stance = sole.name.as_str().into();
             scenario.robot.posture = robot.postures.first().ok_or_else(|| missing("posture"))?.name.clone();
-            Setup { scenario, robot, urdf: arguments.urdf.clone(), notes: Vec::new() }
+            Setup { scenario, robot, urdf: arguments.urdf.clone(), plan: None, notes: Vec::new() }
         }
     };
     Ok(BoardRobot::new(&setup)?.rust())

@@ -30,7 +30,8 @@ use crate::verdict::{Ended, Failure};
 /// [`Failure::Input`] before anything runs, [`Failure::Fault`] when the run broke off.
 pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
     let supervisor = Supervisor::of(arguments);
-    let setup = Setup::read(&arguments.scenario, &arguments.set)?;
+    let mut setup = Setup::read(&arguments.scenario, &arguments.set)?;
+    crate::plan_source::provide(&mut setup, true)?;
     let scenario = &setup.scenario;
     let run = run_id(arguments, &setup)?;
     let mut robot = FaultyPlant::new(SimulatedRobot::new(&setup)?, scenario);

@@ -171,6 +171,7 @@ pub fn push_map(arguments: &PushMapArguments) -> Result<Ended, Failure> {
 fn trial_setup(arguments: &PushMapArguments) -> Result<Setup, Failure> {
     let file = scenario_file(arguments.scenario.as_deref())?;
     let mut setup = Setup::read(&file, &arguments.set)?;
+    crate::plan_source::provide(&mut setup, false)?;
     let scenario = &mut setup.scenario;
     scenario.clock = Clock::Lockstep;
     scenario.reach = None;

@@ -12,10 +12,12 @@ use delmpc_estimation::prelude::{EstimatorConfig, EstimatorModel, FootModel};
 use delmpc_lq::errors::LqError;
 use delmpc_mechanics::reroot::Rerooted;
 use delmpc_messages::{Command, PlantState};
+use delmpc_planner::plan_file::Plan;
 use delmpc_robots::RobotModel;
 use delmpc_scenario::{Clock, ControllerKind, Scenario};
 
 use crate::legged_robot;
+use crate::plan_source::joint_motion;
 use crate::setup::Setup;
 use crate::verdict::Failure;
 
@@ -83,6 +85,9 @@ impl<K> RobotController<K> {
         let joints = model.message_joint.clone();
         let mut controller = core::Controller::new(model, config(setup))
             .map_err(|error| refused(&with_joint(&setup.robot, &joints, &error)))?;
+        if let Some(plan) = &setup.plan {
+            follow(&mut controller, plan, setup).map_err(|error| refused(&error))?;
+        }
         controller.set_origin_ns(0);
         Ok(Self { cycle: Cycle::OneFoot(Box::new(controller)), clock })
     }
@@ -139,6 +144,13 @@ impl<K: CycleClock> Controller for RobotController<K> {
             controller.prepare(&self.clock);
         }
     }
+}
+
+/// The reach goes the way of a plan.
+fn follow(controller: &mut core::Controller, plan: &Plan, setup: &Setup) -> Result<(), String> {
+    let motion = joint_motion(plan, &setup.robot.joint_names)?;
+    let motion = motion.in_order(&controller.model().message_joint).map_err(|error| error.to_string())?;
+    controller.follow(&motion).map_err(|error| format!("plan {}: {error}", plan.name))
 }
 
 /// An error of the controller, with the joint that its index stands for: `joints` has the robot's joint for every one of the controller's.

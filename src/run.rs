@@ -12,6 +12,7 @@ use crate::colour::Colour;
 use crate::one_process::run_in_one_process;
 use crate::output::{line, print, say};
 use crate::part::summarize;
+use crate::plan_source;
 use crate::robot_controller::RobotController;
 use crate::run_folder::RunFolder;
 use crate::setup::{Setup, scenario_file};
@@ -29,7 +30,8 @@ use crate::view::View;
 pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
     let options = &arguments.options;
     let file = scenario_file(arguments.scenario.as_deref())?;
-    let setup = Setup::read(&file, &options.set)?;
+    let mut setup = Setup::read(&file, &options.set)?;
+    plan_source::provide(&mut setup, options.quiet || options.json)?;
     let scenario = &setup.scenario;
     if options.one_process && scenario.clock != Clock::Lockstep {
         return Err(Failure::Input(

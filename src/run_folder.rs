@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `scenario.toml` | effective configuration; runs again by itself: `delmpc run DIR/scenario.toml` |
 //! | `robot.urdf`, `robot.toml` | the robot |
+//! | `plan.json` | the plan that was followed, if there was one |
 //! | `summary.json` | the figures of the run |
 //! | `log.mcap` | what was measured, commanded and true |
 //! | `messages.txt` | what the processes said |
@@ -45,6 +46,8 @@ const MOST_NAMED: usize = 3;
 pub const MOST_TEXT: u64 = 1 << 20;
 /// The robot.
 pub const ROBOT_FILE: &str = "robot.urdf";
+/// The plan that was followed.
+pub const PLAN_FILE: &str = "plan.json";
 /// The run to look at.
 pub const REPORT_FILE: &str = "report.html";
 /// Folder of the report's key plots as pictures.
@@ -262,6 +265,9 @@ impl RunFolder {
         if companion.is_file() {
             copy(&companion, &self.file("robot.toml")).map_err(cannot)?;
         }
+        if let Some(plan) = &setup.plan {
+            fs::write(self.file(PLAN_FILE), plan.to_json().map_err(Failure::fault)?).map_err(cannot)?;
+        }
         Ok(())
     }
 }
@@ -270,6 +276,9 @@ impl RunFolder {
 pub fn effective(setup: &Setup) -> Scenario {
     let mut scenario = setup.scenario.clone();
     scenario.robot.urdf = ROBOT_FILE.to_owned();
+    if let Some(plan) = scenario.plan.as_mut().filter(|_| setup.plan.is_some()) {
+        plan.file = PLAN_FILE.to_owned();
+    }
     scenario
 }
 

@@ -4,11 +4,14 @@ use std::path::{Path, PathBuf};
 
 use delmpc_controller_core::config::ControllerConfig;
 use delmpc_mechanics::prelude::RigidTransform;
+use delmpc_planner::plan_file::Plan;
 use delmpc_messages::{JointSetHasher, MAX_JOINTS, joint_set_hash};
 use delmpc_robots::{BaseChoice, ImpossibleInertia, LoadOptions, RobotError, RobotModel, load_with};
 use delmpc_scenario::{Base, Document, Scenario, Stance};
 
 use crate::check::Findings;
+use crate::plan_source;
+use crate::run_folder::PLAN_FILE;
 use crate::start::Start;
 use crate::verdict::Failure;
 
@@ -29,6 +32,8 @@ pub struct Setup {
     pub robot: RobotModel,
     /// Where the robot was found.
     pub urdf: PathBuf,
+    /// The plan it follows, if it has been read or made ([`crate::plan_source`]).
+    pub plan: Option<Plan>,
     /// What should be known of the overrides.
     pub notes: Vec<String>,
 }
@@ -73,10 +78,17 @@ impl Setup {
         let mut clamped = crate::check::clamp_efforts(&mut robot);
         clamped.extend(crate::stance::weightless(&robot));
         findings.warnings.extend(clamped.into_iter().map(|warning| format!("{}: {warning}", urdf.display())));
-        let mut setup = Self { scenario, robot, urdf, notes: document.notes().to_vec() };
+        let mut setup = Self { scenario, robot, urdf, plan: None, notes: document.notes().to_vec() };
         setup.name_all_soles();
         let of_file = |fault: String| format!("{}: {fault}", file.display());
-        let mut wrong = setup.check_names();
+        let mut wrong: Vec<String> = plan_source::reach_of_plan(&mut setup.scenario).err().into_iter().collect();
+        wrong.extend(setup.check_names());
+        if let Some(named) = setup.scenario.plan.as_ref().map(|plan| &plan.file).filter(|file| !file.is_empty()) {
+            match plan_source::read(file, named) {
+                Ok(plan) => setup.plan = Some(plan),
+                Err(fault) => wrong.push(fault),
+            }
+        }
         match crate::stance::check_scenario(&setup) {
             Ok(warnings) => findings.warnings.extend(warnings),
             Err(fault) => wrong.push(fault),
@@ -91,7 +103,7 @@ impl Setup {
         joint_set_hash(&names)
     }
 
-    /// The files the robot came from, as they are now: name in the run's folder, media type, content.
+    /// The files the robot and its plan came from, as they are now: name in the run's folder, media type, content.
     pub fn robot_files(&self) -> Vec<(String, &'static str, Vec<u8>)> {
         let companion = self.urdf.with_extension("toml");
         let files = [
@@ -101,7 +113,11 @@ impl Setup {
         let content = |(path, name, kind): (&Path, &str, &'static str)| {
             std::fs::read(path).ok().map(|content| (name.to_owned(), kind, content))
         };
-        files.into_iter().filter_map(content).collect()
+        let mut files: Vec<_> = files.into_iter().filter_map(content).collect();
+        if let Some(text) = self.plan.as_ref().and_then(|plan| plan.to_json().ok()) {
+            files.push((PLAN_FILE.to_owned(), "application/json", text.into_bytes()));
+        }
+        files
     }
 
     /// A number that stands for the robot's files, every byte of them: FNV-1a, as for joint sets.

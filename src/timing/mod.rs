@@ -156,6 +156,7 @@ pub fn timing(arguments: &TimingArguments) -> Result<Ended, Failure> {
 fn faults(arguments: &TimingArguments) -> Result<Ended, Failure> {
     let file = scenario_file_or(arguments.scenario.as_deref(), FAULT_SCENARIO)?;
     let mut setup = Setup::read(&file, &arguments.set)?;
+    crate::plan_source::provide(&mut setup, false)?;
     if setup.scenario.fault.is_empty() {
         return Err(Failure::Input(format!("{}: it has no [[fault]]", file.display())));
     }
@@ -193,6 +194,7 @@ fn faults(arguments: &TimingArguments) -> Result<Ended, Failure> {
 fn timing_setup(arguments: &TimingArguments) -> Result<Setup, Failure> {
     let file = scenario_file(arguments.scenario.as_deref())?;
     let mut setup = Setup::read(&file, &arguments.set)?;
+    crate::plan_source::provide(&mut setup, false)?;
     let scenario = &mut setup.scenario;
     let steps = (arguments.duration / scenario.plant.step_s).round();
     if !(1.0..=3600.0).contains(&arguments.duration) {

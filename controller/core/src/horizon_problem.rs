@@ -137,12 +137,15 @@ impl HorizonProblem {
         for (k, &duration) in self.lengths.iter().enumerate() {
             let (x, u) = (nominal.values.x(k), nominal.values.u(k));
             let stage = &mut self.problem.stages[k];
+            let time_s = nominal.start_s + nominal.offsets()[k];
+            reference.sample(time_s, &mut self.targets);
+            reference.sample_torque((time_s, time_s + duration), &mut self.targets);
             for (j, u) in u.iter().enumerate() {
                 let weight = self.torque_weight[j] * duration;
+                let aim = self.dynamics.batch().gravity_force(k, j) + self.targets.torque[j];
                 stage.cost.input_weight[j] = weight;
-                stage.cost.input_gradient[j] = weight * (u - self.dynamics.batch().gravity_force(k, j));
+                stage.cost.input_gradient[j] = weight * (u - aim);
             }
-            reference.sample(nominal.start_s + nominal.offsets()[k], &mut self.targets);
             let node = &self.nodes[k];
             self.tasks.quadratise(tree, node, x.split_at(n), &self.targets, duration, &mut stage.cost);
             bound_inputs(model, config.constraints.torque_fraction, u, stage);

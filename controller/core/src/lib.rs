@@ -12,7 +12,7 @@
 //! [`delmpc_lq::active_set_dual`].
 //!
 //! Reading order: [`model`], [`config`], [`cycle`]; then in the order of the cycle [`estimator`], [`plan`], [`horizon_dynamics`],
-//! [`stage_dynamics`], [`node_kinematics`], [`tasks`], [`mod@reference`], [`contact_wrench`], the solver ([`delmpc_lq`]), [`fallback`].
+//! [`stage_dynamics`], [`node_kinematics`], [`tasks`], [`mod@reference`], [`planned_motion`], [`contact_wrench`], the solver ([`delmpc_lq`]), [`fallback`].
 //! [`tables`] is a robot as constants, [`control_task`] cycle and servo on one processor: for firmware.
 //! [`legged`] is the same cycle for a robot on any set of feet, on the horizons of [`delmpc_horizon`]. Files without public items:
 //! `feedback_law.rs` (what a command carries), `level_stance.rs` (a foot that is not level), `unloaded_robot.rs` (one that carries
@@ -41,6 +41,7 @@ mod level_stance;
 pub mod model;
 pub mod node_kinematics;
 pub mod plan;
+pub mod planned_motion;
 pub mod posture_goal;
 mod prediction;
 pub mod reference;
@@ -57,6 +58,7 @@ pub mod prelude {
     pub use crate::cycle::{Clock, Controller, StoppedClock};
     pub use crate::errors::ControlError;
     pub use crate::model::{BodyPoint, ControllerModel, JointLimits, Sensing};
+    pub use crate::planned_motion::JointMotion;
     pub use crate::reference::Reach;
     pub use crate::tasks::TaskWeights;
 }

@@ -16,6 +16,7 @@ use alloc::vec::Vec;
 use delmpc_mechanics::spatial::{RigidTransform, exp_rotation};
 use nalgebra::{Matrix3, Vector3};
 
+use crate::planned_motion::PlannedMotion;
 use crate::tasks::TaskTargets;
 
 /// A reach to a ball and back. Times in seconds of the run.
@@ -83,6 +84,8 @@ pub struct Reference {
     pub home: PostureGoal,
     /// The reach and the posture it ends in.
     pub reach: Option<(Reach, PostureGoal)>,
+    /// The way there, where it was planned beforehand; it begins with the reach.
+    pub planned: Option<PlannedMotion>,
     /// By how much the mass centre is to be elsewhere than the model says, in {0}, m.
     pub com_shift: Vector3<f64>,
     /// By how much the ball is elsewhere in {0} than the reach has it, m.
@@ -92,7 +95,7 @@ pub struct Reference {
 impl Reference {
     /// Reference at rest at `home`, as the model has it.
     pub fn at(home: PostureGoal) -> Self {
-        Self { home, reach: None, com_shift: Vector3::zeros(), ball_shift: Vector3::zeros() }
+        Self { home, reach: None, planned: None, com_shift: Vector3::zeros(), ball_shift: Vector3::zeros() }
     }
 
     /// Says where the real sole is in {0} and how the mass centre is trimmed there. A ball is given from the middle of the real sole
@@ -121,6 +124,14 @@ impl Reference {
             return;
         };
         let (s, rate, activity) = reach.progress(time_s);
+        targets.hand_activity = activity;
+        let since_s = time_s - reach.start_s;
+        if let Some(planned) = self.planned.as_ref().filter(|_| (0.0..reach.deadline_s).contains(&since_s)) {
+            planned.sample(since_s, targets);
+            targets.com += self.com_shift;
+            targets.hand += self.ball_shift * s;
+            return;
+        }
         for (i, (from, to)) in home.q.iter().zip(&goal.q).enumerate() {
             targets.posture[i] = from + s * (to - from);
             targets.posture_rate[i] = rate * (to - from);
@@ -130,8 +141,15 @@ impl Reference {
         let way = Vector3::from(reach.ball_m) + self.ball_shift - home.hand;
         targets.hand = home.hand + way * s;
         targets.hand_velocity = way * rate;
-        targets.hand_activity = activity;
         targets.swing_foot = home.swing_foot + (goal.swing_foot - home.swing_foot) * s;
+    }
+
+    /// Fills the torques beyond those of rest for a span of the run (s): those of the planned motion, else none.
+    pub fn sample_torque(&self, (from_s, to_s): (f64, f64), targets: &mut TaskTargets) {
+        targets.torque.fill(0.0);
+        if let (Some((reach, _)), Some(planned)) = (&self.reach, &self.planned) {
+            planned.mean_torque((from_s - reach.start_s, to_s - reach.start_s), &mut targets.torque);
+        }
     }
 }
 

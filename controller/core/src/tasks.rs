@@ -81,6 +81,8 @@ pub struct TaskTargets {
     pub posture: Vec<f64>,
     /// Joint rates.
     pub posture_rate: Vec<f64>,
+    /// Joint torques beyond those that hold the posture against gravity, mean over a stage, N m or N.
+    pub torque: Vec<f64>,
     /// Mass centre in {0}, m.
     pub com: Vector3<f64>,
     /// Its velocity, m/s.
@@ -103,6 +105,7 @@ impl TaskTargets {
         Self {
             posture: vec![0.0; n],
             posture_rate: vec![0.0; n],
+            torque: vec![0.0; n],
             com: Vector3::zeros(),
             com_velocity: Vector3::zeros(),
             hand: Vector3::zeros(),

@@ -9,11 +9,14 @@ use nalgebra::Vector3;
 use super::Controller;
 use crate::errors::ControlError;
 use crate::horizon_dynamics::HorizonDynamics;
+use crate::planned_motion::{JointMotion, PlannedMotion};
 use crate::posture_goal::{posture_goal, reach_posture};
 use crate::reference::Reach;
 
 /// A goal farther than this from where the hand is in the balanced posture nearest to it is moved there, m.
 const UNREACHABLE_M: f64 = 0.01;
+/// Times nearer to each other than this are the same, s.
+const SAME_TIME_S: f64 = 1e-6;
 
 impl Controller {
     /// Cost and gain of standing still for ever, at the home posture.
@@ -79,6 +82,7 @@ impl Controller {
     /// [`ControlError::Model`] when the model has no hand, [`ControlError::Mechanics`] when it does not fit.
     pub fn set_reach(&mut self, reach: Option<Reach>) -> Result<(), ControlError> {
         self.asked_reach = reach;
+        self.reference.planned = None;
         let Some(reach) = reach else {
             self.hand_distance_left_m = 0.0;
             self.reference.reach = None;
@@ -96,6 +100,25 @@ impl Controller {
             reach.ball_m = goal.hand.into();
         }
         self.reference.reach = Some((reach, goal));
+        Ok(())
+    }
+
+    /// The reach goes the way of a planned motion, which begins with it and takes as long as it has; hold and return are those of the reach.
+    /// A new reach or posture ends this. Allocates.
+    ///
+    /// # Errors
+    /// [`ControlError::Model`] without a reach, for a motion that does not fit the robot, and for one that takes another time.
+    pub fn follow(&mut self, motion: &JointMotion) -> Result<(), ControlError> {
+        let Some((reach, goal)) = &mut self.reference.reach else {
+            return Err(ControlError::Model { reason: "a planned motion needs a reach: when it begins, and its ball" });
+        };
+        let planned = PlannedMotion::new(&self.model, motion)?;
+        if (planned.duration_s() - reach.deadline_s).abs() > SAME_TIME_S {
+            return Err(ControlError::Model { reason: "a planned motion takes as long as the reach has until its deadline" });
+        }
+        goal.clone_from(planned.end());
+        self.hand_distance_left_m = (goal.hand - Vector3::from(reach.ball_m)).norm();
+        self.reference.planned = Some(planned);
         Ok(())
     }
 }
