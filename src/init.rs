@@ -104,7 +104,8 @@ pub fn init(arguments: &InitArguments) -> Result<Ended, Failure> {
     let made = make(urdf, &text, arguments.stand)?;
 
     let write = |file: &Path, text: &str| {
-        output_file::write_named(file, text).map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))
+        output_file::write_named(file, text)
+            .map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))
     };
     std::fs::create_dir_all(&folder)
         .map_err(|error| Failure::Fault(format!("{}: {error}", folder.display())))?;

@@ -444,6 +444,41 @@ mod tests {
         );
     }
 
+    /// A process that is killed takes what is not in the file with it.
+    #[test]
+    fn of_what_is_handed_over_all_but_50_ms_gets_into_the_file_without_an_end() {
+        let path = std::env::temp_dir().join(format!("delmpc-log-open-{}.mcap", std::process::id()));
+        let mut log = Log::create(&path, LogHead::default(), false, true).unwrap();
+        let last_ns = || {
+            let mut last_ns = 0;
+            // The file may end anywhere while it is being written.
+            let read = crate::log_reader::LogReader::open(&path).and_then(|mut reader| {
+                reader.each(|item| {
+                    if let crate::log_reader::Item::Message { time_ns, .. } = item {
+                        last_ns = last_ns.max(time_ns);
+                    }
+                    Ok(true)
+                })
+            });
+            read.map_or(0, |_| last_ns)
+        };
+        for turn in 1..=5 {
+            for k in 0..200 {
+                let mut truth = Truth::new(3);
+                truth.time_ns = (200 * turn + k) * 1_000_000;
+                log.truth(&truth);
+            }
+            let handed_over_ns = (200 * turn + 199) * 1_000_000;
+            let begin = std::time::Instant::now();
+            while last_ns() + 50_000_000 < handed_over_ns {
+                assert!(begin.elapsed().as_secs() < 60, "{} of {handed_over_ns} ns", last_ns());
+                std::thread::sleep(std::time::Duration::from_millis(5));
+            }
+        }
+        assert_eq!(log.finish().unwrap(), 0);
+        std::fs::remove_file(path).unwrap();
+    }
+
     #[test]
     fn what_is_logged_is_read_back_bit_by_bit_and_the_file_is_reproducible() {
         let folder = std::env::temp_dir();

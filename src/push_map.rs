@@ -153,7 +153,8 @@ pub fn push_map(arguments: &PushMapArguments) -> Result<Ended, Failure> {
     let limits = gather(&setup, arguments.seeds, &searches, found);
     let write = |name: &str, text: &str| {
         let file = folder.join(name);
-        output_file::write(&file, text).map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))
+        output_file::write(&file, text)
+            .map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))
     };
     let json = serde_json::to_string_pretty(&limits).map_err(Failure::fault)?;
     write("push_map.json", &json)?;

@@ -141,7 +141,8 @@ pub fn timing(arguments: &TimingArguments) -> Result<Ended, Failure> {
     };
     let json = serde_json::to_string_pretty(&report).map_err(Failure::fault)?;
     let file = folder.join("timing.json");
-    output_file::write(&file, &json).map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))?;
+    output_file::write(&file, &json)
+        .map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))?;
     pictures::write(&report, &folder)?;
     if arguments.json {
         line(&json)?;
@@ -177,7 +178,8 @@ fn faults(arguments: &TimingArguments) -> Result<Ended, Failure> {
     let Some(trials) = trials else { return Ok(Ended::Interrupted) };
     let json = serde_json::to_string_pretty(&trials).map_err(Failure::fault)?;
     let file = folder.join("faults.json");
-    output_file::write(&file, &json).map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))?;
+    output_file::write(&file, &json)
+        .map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))?;
     if arguments.json {
         line(&json)?;
     } else {

@@ -443,6 +443,26 @@ mod tests {
     }
 
     #[test]
+    fn however_long_a_run_is_the_newest_rows_are_told_and_memory_is_bounded() {
+        let mut rows = Rows::default();
+        let (last, mut told) = (3 * MOST_ROWS, 0);
+        for number in 0..=last {
+            rows.push(number.to_string().into());
+            let (number_told, row) = rows.from(told).unwrap();
+            assert_eq!(
+                (number_told, &*row),
+                (number, &*number.to_string()),
+                "a page that follows misses a row"
+            );
+            told = number_told + 1;
+            assert_eq!(rows.from(told), None);
+        }
+        assert_eq!(rows.kept.len(), MOST_ROWS);
+        // Who comes late gets what is kept.
+        assert_eq!(rows.from(0).unwrap().0, last + 1 - MOST_ROWS);
+    }
+
+    #[test]
     #[allow(clippy::result_large_err, reason = "the type is that of the websocket crate")]
     fn only_the_page_itself_gets_the_stream() {
         let server = Server::start(0, String::new(), PlantPipe::default()).unwrap();
