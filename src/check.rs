@@ -10,9 +10,11 @@ use std::path::{Path, PathBuf};
 use delmpc_mechanics::kinematics::{Configuration, Kinematics};
 use delmpc_mechanics::mass_matrix::{MassMatrixWorkspace, mass_matrix_into};
 use delmpc_mechanics::prelude::{JointKind, KinematicTree, RigidTransform};
+use delmpc_robots::limits::MAX_COMPANION_BYTES;
 use delmpc_robots::{LoadOptions, RobotModel, load_with};
 use nalgebra::DMatrix;
 
+use crate::input_file;
 use crate::output::{line, say};
 use crate::robot_controller::RobotController;
 use crate::setup::Setup;
@@ -93,7 +95,7 @@ fn findings(file: &Path, overrides: &[String], strict: bool) -> Findings {
     let beside = file.with_extension("urdf");
     let is_table = extension == "toml"
         && beside.is_file()
-        && std::fs::read_to_string(file).is_ok_and(|text| {
+        && input_file::read_text(file, MAX_COMPANION_BYTES as u64).is_ok_and(|text| {
             text.lines().any(|line| line.split('=').next().is_some_and(|key| key.trim() == "format"))
         });
     match (extension, is_table) {

@@ -21,6 +21,7 @@ pub mod tip;
 use std::path::{Path, PathBuf};
 
 use delmpc_messages::MAX_JOINTS;
+use delmpc_robots::limits::MAX_URDF_BYTES;
 use delmpc_robots::{
     BaseChoice, Companion, ImpossibleInertia, LoadOptions, RobotError, RobotModel, Rule, load_str, load_with,
 };
@@ -29,7 +30,9 @@ use crate::check::weightless_joints;
 use crate::init::feet::{FoundFoot, NoFeet, find_feet};
 use crate::init::files::Table;
 use crate::init::scenario_text::{Size, Support, scenario_text};
+use crate::input_file;
 use crate::output::{line, say};
+use crate::output_file;
 use crate::robot_controller::RobotController;
 use crate::setup::Setup;
 use crate::verdict::{Ended, Failure};
@@ -95,13 +98,14 @@ pub fn init(arguments: &InitArguments) -> Result<Ended, Failure> {
             )));
         }
     }
-    let text = std::fs::read_to_string(urdf).map_err(|error| {
+    let text = input_file::read_text(urdf, MAX_URDF_BYTES as u64).map_err(|error| {
         Failure::Input(format!("{}: cannot be read ({error}): give a URDF file", urdf.display()))
     })?;
     let made = make(urdf, &text, arguments.stand)?;
 
     let write = |file: &Path, text: &str| {
-        std::fs::write(file, text).map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))
+        output_file::write_named(file, text)
+            .map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))
     };
     std::fs::create_dir_all(&folder)
         .map_err(|error| Failure::Fault(format!("{}: {error}", folder.display())))?;

@@ -67,6 +67,7 @@ mod model_table;
 pub mod observer;
 pub mod one_process;
 pub mod output;
+pub mod output_file;
 pub mod part;
 pub mod plan;
 pub mod plan_page;

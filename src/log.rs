@@ -6,9 +6,10 @@
 //!
 //! Beside them, in JSON, what makes viewers show the robot: [`crate::log_viewer`]. Scenario and robot are attached as files.
 //!
-//! The loop only copies records into a ring of memory that is there before the run ([`crate::log_queue`]). A thread of ordinary priority
-//! writes them ([`crate::log_file`]), so that a killed process loses what is younger than 50 ms. When the thread cannot keep up for seconds,
-//! records are refused and counted in real time, and waited for in lockstep. Messages are numbered by the loop: what is missing shows.
+//! The loop only copies records into a ring of memory that is there before the run ([`crate::log_queue`]). A thread of its own writes
+//! them ([`crate::log_file`]), so that a killed process loses what is younger than 50 ms: in real time it goes before ordinary programs,
+//! which would keep it from the cores for longer than that, and after plant and controller. When it cannot keep up for seconds, records are
+//! refused and counted in real time, and waited for in lockstep. Messages are numbered by the loop: what is missing shows.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -16,6 +17,7 @@ use std::path::Path;
 use std::thread::JoinHandle;
 
 use bytemuck::bytes_of;
+use delmpc_controller_process::machine::go_before_ordinary_programs;
 use delmpc_messages::{Command, PlantState};
 
 use crate::log_command;
@@ -78,13 +80,14 @@ pub struct Log {
 }
 
 impl Log {
-    /// Opens the file and starts the writer. `waits`: when the ring is full, wait, do not drop.
+    /// Opens the file and starts the writer. `waits`: when the ring is full, wait, do not drop. `first`: the writer goes before ordinary
+    /// programs, where that is permitted.
     ///
-    /// Make it before raising the priority: the writer is an ordinary thread.
+    /// Make it before raising the priority: the writer would inherit it.
     ///
     /// # Errors
     /// When the file cannot be made.
-    pub fn create(path: &Path, head: LogHead, waits: bool) -> Result<Self, Failure> {
+    pub fn create(path: &Path, head: LogHead, waits: bool, first: bool) -> Result<Self, Failure> {
         let cannot = |error: io::Error| Failure::Fault(format!("{}: {error}", path.display()));
         let room = if waits { LOCKSTEP_RING } else { REALTIME_RING };
         let (sender, receiver) = queue(room).map_err(|error| {
@@ -94,7 +97,12 @@ impl Log {
         let viewer = head.viewer;
         let writer = std::thread::Builder::new()
             .name("log".to_owned())
-            .spawn(move || write_all(file, channels, viewer, receiver))
+            .spawn(move || {
+                if first {
+                    go_before_ordinary_programs();
+                }
+                write_all(file, channels, viewer, receiver)
+            })
             .map_err(cannot)?;
         Ok(Self {
             sender: Some(sender),
@@ -436,6 +444,41 @@ mod tests {
         );
     }
 
+    /// A process that is killed takes what is not in the file with it.
+    #[test]
+    fn of_what_is_handed_over_all_but_50_ms_gets_into_the_file_without_an_end() {
+        let path = std::env::temp_dir().join(format!("delmpc-log-open-{}.mcap", std::process::id()));
+        let mut log = Log::create(&path, LogHead::default(), false, true).unwrap();
+        let last_ns = || {
+            let mut last_ns = 0;
+            // The file may end anywhere while it is being written.
+            let read = crate::log_reader::LogReader::open(&path).and_then(|mut reader| {
+                reader.each(|item| {
+                    if let crate::log_reader::Item::Message { time_ns, .. } = item {
+                        last_ns = last_ns.max(time_ns);
+                    }
+                    Ok(true)
+                })
+            });
+            read.map_or(0, |_| last_ns)
+        };
+        for turn in 1..=5 {
+            for k in 0..200 {
+                let mut truth = Truth::new(3);
+                truth.time_ns = (200 * turn + k) * 1_000_000;
+                log.truth(&truth);
+            }
+            let handed_over_ns = (200 * turn + 199) * 1_000_000;
+            let begin = std::time::Instant::now();
+            while last_ns() + 50_000_000 < handed_over_ns {
+                assert!(begin.elapsed().as_secs() < 60, "{} of {handed_over_ns} ns", last_ns());
+                std::thread::sleep(std::time::Duration::from_millis(5));
+            }
+        }
+        assert_eq!(log.finish().unwrap(), 0);
+        std::fs::remove_file(path).unwrap();
+    }
+
     #[test]
     fn what_is_logged_is_read_back_bit_by_bit_and_the_file_is_reproducible() {
         let folder = std::env::temp_dir();
@@ -445,6 +488,7 @@ mod tests {
                 &path,
                 LogHead { about: [("seed".into(), "1".into())].into(), ..LogHead::default() },
                 true,
+                false,
             )
             .unwrap();
             for k in 0..3000 {

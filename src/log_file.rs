@@ -6,12 +6,14 @@
 //!
 //! Source: MCAP format specification, version 0.
 
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
 use mcap::MAGIC;
 use mcap::records::op;
+
+use crate::output_file;
 
 /// Simulated time that a chunk spans at most (ns): so much is lost, beside what has not been handed over yet, when the process is killed.
 const CHUNK_NS: u64 = 20_000_000;
@@ -62,7 +64,7 @@ impl LogFile {
     /// # Errors
     /// When the file, or one beside it for the index, cannot be made.
     pub fn create(path: &Path) -> io::Result<Self> {
-        let file = File::create(path)?;
+        let file = output_file::create(path)?;
         let mut log = Self {
             file,
             offset: 0,
@@ -349,7 +351,7 @@ impl LogFile {
 /// A file that is gone when it is closed, beside another one.
 fn nameless(beside: &Path) -> io::Result<File> {
     let path = beside.with_extension("index");
-    let file = OpenOptions::new().read(true).write(true).create(true).truncate(true).open(&path)?;
+    let file = output_file::create(&path)?;
     std::fs::remove_file(&path)?;
     Ok(file)
 }

@@ -16,6 +16,8 @@ use delmpc_robots::{Mesh, RobotModel};
 use mesh_loader::Loader;
 use nalgebra::Vector3;
 
+use crate::input_file;
+
 /// Larger files are not read, bytes.
 const MOST_BYTES: u64 = 64 << 20;
 
@@ -88,14 +90,10 @@ pub fn folder_of(robot: &RobotModel) -> PathBuf {
 /// Reads a mesh of a robot; `None` when its file is not there or cannot be read.
 pub fn read(robot: &RobotModel, mesh: &Mesh) -> Option<Triangles> {
     let path = find(&folder_of(robot), &mesh.file)?;
-    let size = std::fs::metadata(&path).ok()?.len();
-    if size > MOST_BYTES {
-        return None;
-    }
+    let bytes = input_file::read_bytes(&path, MOST_BYTES).ok()?;
     // Names end in .STL as well.
     let lower = PathBuf::from(path.to_string_lossy().to_lowercase());
-    let scene =
-        Loader::default().merge_meshes(true).load_from_slice(&std::fs::read(&path).ok()?, lower).ok()?;
+    let scene = Loader::default().merge_meshes(true).load_from_slice(&bytes, lower).ok()?;
     let mesh_data = scene.meshes.into_iter().next()?;
     let pose: &RigidTransform = &mesh.attachment.pose;
     let to_body = |vertex: &[f32; 3]| {

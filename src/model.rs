@@ -24,6 +24,7 @@ use crate::init::posture::stand_on;
 use crate::input_file::read_answerable;
 use crate::model_table::table;
 use crate::output::{line, print, printable};
+use crate::output_file;
 use crate::setup::Setup;
 use crate::verdict::{Ended, Failure};
 
@@ -138,7 +139,7 @@ pub fn model(arguments: &ModelArguments) -> Result<Ended, Failure> {
             print(&printable(&table(&robot)?))?;
             if let Some(file) = &arguments.svg {
                 let svg = drawing(&robot).map_err(Failure::input)?;
-                std::fs::write(file, svg)
+                output_file::write_named(file, svg)
                     .map_err(|error| Failure::Input(format!("--svg {}: {error}", file.display())))?;
             }
         }

@@ -28,7 +28,7 @@ use crate::verdict::Failure;
 /// # Errors
 /// [`Failure::Input`] when a part cannot be made of the scenario, [`Failure::Fault`] when the log cannot be written.
 pub fn run_in_one_process(setup: &Setup, folder: &RunFolder, stop: &StopFlag) -> Result<Course, Failure> {
-    let log = Log::create(&folder.file("log.mcap"), log_head(setup, RunId(0)), true)?;
+    let log = Log::create(&folder.file("log.mcap"), log_head(setup, RunId(0)), true, false)?;
     match simulate(setup, log, stop)? {
         Simulated::Fault(why) => Ok(Course::Fault(why)),
         Simulated::Ended { plant, figures } => {

@@ -20,11 +20,12 @@ use serde::de::DeserializeOwned;
 use crate::cli::PartArguments;
 use crate::colour::Colour;
 use crate::output::{line, print, say};
-use crate::run_folder::{CONTROLLER_PART, PLANT_PART, RunFolder};
+use crate::run_folder::{CONTROLLER_PART, MOST_TEXT, PLANT_PART, RunFolder};
 use crate::setup::Setup;
 use crate::summary::Summary;
 use crate::summary_table::summary_table;
 use crate::verdict::{Ended, Failure};
+use crate::{input_file, output_file};
 
 /// The run a process belongs to: the named one, or one made from the scenario, so that two processes of the same scenario meet.
 ///
@@ -182,7 +183,7 @@ pub fn summarize(setup: &Setup, folder: &RunFolder, fault: Option<String>) -> Re
 /// Reads a process's part of the results and removes the file; `None` when the process left none.
 fn take_part<T: DeserializeOwned>(file: &Path) -> Result<Option<T>, String> {
     let wrong = |error: &dyn std::fmt::Display| format!("{}: {error}", file.display());
-    match std::fs::read_to_string(file) {
+    match input_file::read_text(file, MOST_TEXT) {
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
         Err(error) => Err(wrong(&error)),
         Ok(text) => {
@@ -205,7 +206,7 @@ pub fn leave_part(folder: Option<&Path>, name: &str, part: &impl Serialize) -> R
             let file = folder.join(name);
             // Whole or not at all: the supervisor may look at any time.
             let aside = folder.join(format!(".{name}"));
-            let moved = std::fs::write(&aside, text).and_then(|()| std::fs::rename(&aside, &file));
+            let moved = output_file::write(&aside, text).and_then(|()| std::fs::rename(&aside, &file));
             moved.map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))
         }
     }
@@ -221,7 +222,7 @@ pub fn leave_records<R: Pod>(folder: Option<&Path>, name: &str, records: &Record
         say(&format!("warning: no room for {} of the records in {name}", records.lost()));
     }
     let file = folder.join(name);
-    std::fs::write(&file, records.bytes())
+    output_file::write(&file, records.bytes())
         .map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))
 }
 

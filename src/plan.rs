@@ -11,6 +11,7 @@ use delmpc_robots::load;
 use delmpc_scenario::Document;
 
 use crate::colour::Colour;
+use crate::output_file;
 use crate::plan_page;
 use crate::plan_source::search;
 use crate::plan_task::task_of;
@@ -82,7 +83,8 @@ fn check_plan(file: &Path, arguments: &PlanArguments) -> Result<Ended, Failure> 
     say(&plan, &findings, found.as_ref(), arguments.json)?;
     if let Some(page) = &arguments.page {
         let html = plan_page::page(&plan, &robot, &findings, found.as_ref())?;
-        std::fs::write(page, html).map_err(|error| Failure::Fault(format!("{}: {error}", page.display())))?;
+        output_file::write_named(page, html)
+            .map_err(|error| Failure::Fault(format!("{}: {error}", page.display())))?;
     }
     let holds = findings.passes(&Bounds::default());
     Ok(if holds { Ended::Well } else { Ended::CriterionMissed })
@@ -110,11 +112,13 @@ fn make_plan(file: &Path, arguments: &PlanArguments) -> Result<Ended, Failure> {
         }
     };
     let text = planned.plan.to_json().map_err(Failure::fault)?;
-    std::fs::write(&out, text).map_err(|error| Failure::Fault(format!("{}: {error}", out.display())))?;
+    output_file::write_named(&out, text)
+        .map_err(|error| Failure::Fault(format!("{}: {error}", out.display())))?;
     let found = execute(&planned.plan, &task.robot).ok();
     let page = out.with_extension("html");
     let html = plan_page::page(&planned.plan, &task.robot, &planned.findings, found.as_ref())?;
-    std::fs::write(&page, html).map_err(|error| Failure::Fault(format!("{}: {error}", page.display())))?;
+    output_file::write_named(&page, html)
+        .map_err(|error| Failure::Fault(format!("{}: {error}", page.display())))?;
     say(&planned.plan, &planned.findings, found.as_ref(), arguments.json)?;
     if !arguments.json {
         say_attempts(&planned);

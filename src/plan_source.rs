@@ -159,7 +159,10 @@ pub fn reach_of_plan(scenario: &mut Scenario) -> Result<(), String> {
     };
     let far = |a: &[f64; 3], b: &[f64; 3]| a.iter().zip(b).any(|(a, b)| (a - b).abs() > SAME);
     if reach.hand != plan.hand {
-        return Err(format!("`reach.hand` = \"{}\" and `plan.hand` = \"{}\" are to be the same", reach.hand, plan.hand));
+        return Err(format!(
+            "`reach.hand` = \"{}\" and `plan.hand` = \"{}\" are to be the same",
+            reach.hand, plan.hand
+        ));
     }
     if far(&reach.ball_m, &plan.target_m) {
         return Err("`reach.ball_m` and `plan.target_m` are to be the same".to_owned());
@@ -179,7 +182,9 @@ pub fn joint_motion(plan: &Plan, joints: &[String]) -> Result<JointMotion, Strin
         .iter()
         .map(|joint| {
             let place = plan.coordinates.iter().position(|coordinate| coordinate == joint);
-            place.ok_or_else(|| format!("plan {}: it has no joint `{joint}`: it is of another robot", plan.name))
+            place.ok_or_else(|| {
+                format!("plan {}: it has no joint `{joint}`: it is of another robot", plan.name)
+            })
         })
         .collect::<Result<Vec<usize>, String>>()?;
     let begin_s = plan.t.first().copied().unwrap_or(0.0);

@@ -14,16 +14,10 @@ use delmpc_scenario::{PlanSettings, PlanWeightSettings, Scenario};
 ///
 /// # Errors
 /// A robot that cannot be read or planned for; a hand, joint or coordinate that it does not have.
-pub fn task_of(
-    urdf: &Path,
-    scenario: &Scenario,
-    settings: &PlanSettings,
-) -> Result<Task, PlanError> {
+pub fn task_of(urdf: &Path, scenario: &Scenario, settings: &PlanSettings) -> Result<Task, PlanError> {
     let options = crate::setup::load_options(scenario);
-    let model = load_with(urdf, &options).map_err(|error| PlanError::PlanFile {
-        file: urdf.display().to_string(),
-        what: error.to_string(),
-    })?;
+    let model = load_with(urdf, &options)
+        .map_err(|error| PlanError::PlanFile { file: urdf.display().to_string(), what: error.to_string() })?;
     let springs: Vec<(&str, f64, f64)> = settings
         .spring
         .iter()

@@ -38,7 +38,9 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
     let part = PartFolder::enter(arguments, Role::Plant, &setup)?;
     let log = match &arguments.out {
         Some(folder) if !arguments.timing => {
-            Log::create(&folder.join("log.mcap"), log_head(&setup, run), scenario.clock == Clock::Lockstep)?
+            let waits = scenario.clock == Clock::Lockstep;
+            let first = !waits && scenario.process.priority > 0;
+            Log::create(&folder.join("log.mcap"), log_head(&setup, run), waits, first)?
         }
         _ => Log::none(),
     };

@@ -32,6 +32,7 @@ use serde::Serialize;
 use crate::log::Log;
 use crate::one_process::{Simulated, simulate};
 use crate::output::{line, print};
+use crate::output_file;
 use crate::run_folder::claim_or;
 use crate::setup::{Setup, scenario_file};
 use crate::summary::Summary;
@@ -152,7 +153,8 @@ pub fn push_map(arguments: &PushMapArguments) -> Result<Ended, Failure> {
     let limits = gather(&setup, arguments.seeds, &searches, found);
     let write = |name: &str, text: &str| {
         let file = folder.join(name);
-        std::fs::write(&file, text).map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))
+        output_file::write(&file, text)
+            .map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))
     };
     let json = serde_json::to_string_pretty(&limits).map_err(Failure::fault)?;
     write("push_map.json", &json)?;

@@ -25,7 +25,10 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use delmpc_messages::Role;
 use delmpc_scenario::Scenario;
+use rustix::fs::OFlags;
 
+use crate::input_file::{self, open_plain};
+use crate::output_file;
 use crate::setup::Setup;
 use crate::verdict::Failure;
 
@@ -39,6 +42,8 @@ const LOCK_ATTEMPTS: u32 = 100;
 const LOCK_PAUSE: Duration = Duration::from_millis(20);
 /// Files named when a folder is refused.
 const MOST_NAMED: usize = 3;
+/// Most bytes of a scenario, of a summary and of its parts.
+pub const MOST_TEXT: u64 = 1 << 20;
 /// The robot.
 pub const ROBOT_FILE: &str = "robot.urdf";
 /// The plan that was followed.
@@ -85,8 +90,7 @@ pub fn claim_or(named: Option<&Path>, usual: &str) -> Result<(PathBuf, File), Fa
     let path = named.unwrap_or(Path::new(usual)).to_owned();
     if named.is_none() {
         fs::create_dir_all(&path).map_err(|error| unusable(&path, &error))?;
-        let made = OpenOptions::new().append(true).create(true).open(path.join(MARKER));
-        made.map_err(|error| unusable(&path, &error))?;
+        open_lock(&path.join(MARKER)).map_err(|error| unusable(&path, &error))?;
     }
     let lock = claim(&path)?;
     Ok((path, lock))
@@ -117,20 +121,18 @@ fn marked(path: &Path) -> Result<File, Failure> {
             )));
         }
     }
-    let nofollow = rustix::fs::OFlags::NOFOLLOW.bits() as i32;
-    let opened = OpenOptions::new()
-        .read(true)
-        .write(true)
-        .create(true)
-        .truncate(false)
-        .custom_flags(nofollow)
-        .open(&marker);
-    opened.map_err(|error| unusable(path, &error))
+    open_lock(&marker).map_err(|error| unusable(path, &error))
+}
+
+/// Opens a file that serves as a lock; makes it. No link is followed, no pipe waited for.
+fn open_lock(path: &Path) -> std::io::Result<File> {
+    let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
+    OpenOptions::new().read(true).write(true).create(true).truncate(false).custom_flags(flags).open(path)
 }
 
 /// Runs of versions that left no marker left a log beside a scenario.
 fn is_of_earlier_run(path: &Path) -> bool {
-    let magic = fs::File::open(path.join("log.mcap")).and_then(|mut log| {
+    let magic = open_plain(&path.join("log.mcap")).and_then(|mut log| {
         let mut magic = [0; mcap::MAGIC.len()];
         std::io::Read::read_exact(&mut log, &mut magic).map(|()| magic)
     });
@@ -172,8 +174,7 @@ impl RunFolder {
     pub fn join(path: &Path, role: Role, setup: &Setup) -> Result<Self, Failure> {
         let marker = marked(path)?;
         let own = path.join(format!("{MARKER}-{}", role.name()));
-        let own = OpenOptions::new().write(true).create(true).truncate(false).open(own);
-        let own = own.map_err(|error| unusable(path, &error))?;
+        let own = open_lock(&own).map_err(|error| unusable(path, &error))?;
         if own.try_lock().is_err() {
             let role = role.name();
             return Err(Failure::Input(format!(
@@ -198,7 +199,7 @@ impl RunFolder {
             }
             sleep(LOCK_PAUSE);
         }
-        let written = fs::read_to_string(folder.file("scenario.toml")).unwrap_or_default();
+        let written = input_file::read_text(&folder.file("scenario.toml"), MOST_TEXT).unwrap_or_default();
         if written != effective(setup).to_toml() {
             return Err(Failure::Input(format!(
                 "--out {}: a process of another scenario is writing into it: give both the same, --set included",
@@ -231,9 +232,12 @@ impl RunFolder {
         }
         let path = runs.join(&folder);
         let lock = claim(&path)?;
-        // Made aside and moved, so that the link always points to a run. That it cannot be made is no reason not to run.
+        // Made aside and moved, so that the link always points to a run. That it cannot be made is no reason not to run;
+        // what is no link there is the user's.
         let aside = runs.join(format!(".latest-{folder}"));
-        if symlink(&folder, &aside).is_ok() && fs::rename(&aside, runs.join("latest")).is_err() {
+        let latest = runs.join("latest");
+        let is_a_link = fs::symlink_metadata(&latest).map_or(true, |there| there.is_symlink());
+        if is_a_link && symlink(&folder, &aside).is_ok() && fs::rename(&aside, &latest).is_err() {
             let _ = fs::remove_file(&aside);
         }
         Ok(Self { path, locks: Arc::new([lock]) })
@@ -255,7 +259,7 @@ impl RunFolder {
     /// [`Failure::Input`] when they cannot be written.
     pub fn write_inputs(&self, setup: &Setup) -> Result<(), Failure> {
         let cannot = |error| Failure::Input(format!("{}: {error}", self.path.display()));
-        fs::write(self.file("scenario.toml"), effective(setup).to_toml()).map_err(cannot)?;
+        output_file::write(&self.file("scenario.toml"), effective(setup).to_toml()).map_err(cannot)?;
         copy(&setup.urdf, &self.file(ROBOT_FILE)).map_err(cannot)?;
         let companion = setup.urdf.with_extension("toml");
         if companion.is_file() {
@@ -292,7 +296,7 @@ fn remove_results(path: &Path) -> Result<(), Failure> {
 /// Copies content, not permissions; a file onto itself stays.
 fn copy(from: &Path, to: &Path) -> std::io::Result<()> {
     let content = fs::read(from)?;
-    fs::write(to, content)
+    output_file::write(to, content)
 }
 
 /// `20260131T094501Z`.

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use delmpc_controller_core::config::ControllerConfig;
 use delmpc_mechanics::prelude::RigidTransform;
-use delmpc_planner::plan_file::Plan;
 use delmpc_messages::{JointSetHasher, MAX_JOINTS, joint_set_hash};
+use delmpc_planner::plan_file::Plan;
 use delmpc_robots::{BaseChoice, ImpossibleInertia, LoadOptions, RobotError, RobotModel, load_with};
 use delmpc_scenario::{Base, Document, Scenario, Stance};
 
@@ -81,9 +81,12 @@ impl Setup {
         let mut setup = Self { scenario, robot, urdf, plan: None, notes: document.notes().to_vec() };
         setup.name_all_soles();
         let of_file = |fault: String| format!("{}: {fault}", file.display());
-        let mut wrong: Vec<String> = plan_source::reach_of_plan(&mut setup.scenario).err().into_iter().collect();
+        let mut wrong: Vec<String> =
+            plan_source::reach_of_plan(&mut setup.scenario).err().into_iter().collect();
         wrong.extend(setup.check_names());
-        if let Some(named) = setup.scenario.plan.as_ref().map(|plan| &plan.file).filter(|file| !file.is_empty()) {
+        if let Some(named) =
+            setup.scenario.plan.as_ref().map(|plan| &plan.file).filter(|file| !file.is_empty())
+        {
             match plan_source::read(file, named) {
                 Ok(plan) => setup.plan = Some(plan),
                 Err(fault) => wrong.push(fault),

@@ -6,6 +6,7 @@ use delmpc_scenario::{Clock, Scenario};
 use serde::{Deserialize, Serialize};
 
 use crate::metrics::RobotFigures;
+use crate::output_file;
 
 /// What the plant process found out.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -119,7 +120,7 @@ impl Summary {
     pub fn write(&self, file: &Path) -> std::io::Result<()> {
         let mut text = serde_json::to_string_pretty(&self.to_json())?;
         text.push('\n');
-        std::fs::write(file, text)
+        output_file::write(file, text)
     }
 }
 

@@ -29,6 +29,7 @@ use delmpc_transport::{RunId, RunNode, remove_leftovers};
 use rustix::process::{Pid, Signal, kill_process};
 
 use crate::output::printable;
+use crate::output_file;
 use crate::verdict::Failure;
 
 /// Time between two looks at the processes.
@@ -178,7 +179,7 @@ impl Supervision {
     ) -> Result<Course, Failure> {
         let node = RunNode::open(self.run, 0).map_err(Failure::fault)?;
         let mut presence = Presence::new(&node, 0, Role::Supervisor).map_err(Failure::fault)?;
-        let messages = File::create(&self.messages).map_err(Failure::fault)?;
+        let messages = output_file::create(&self.messages).map_err(Failure::fault)?;
         let messages = Arc::new(Mutex::new(messages));
         let mut processes = Vec::new();
         let mut roles = [Role::Plant, Role::Controller];

@@ -14,9 +14,10 @@
 use std::path::{Path, PathBuf};
 
 use crate::output::{line, say};
-use crate::run_folder::{PLOTS_FOLDER, REPORT_FILE};
+use crate::run_folder::{MOST_TEXT, PLOTS_FOLDER, REPORT_FILE};
 use crate::setup::Setup;
 use crate::verdict::{Ended, Failure};
+use crate::{input_file, output_file};
 
 pub mod canvas;
 pub mod colours;
@@ -55,20 +56,20 @@ pub fn write(folder: &Path) -> Result<PathBuf, Failure> {
         say(&format!("warning: {}: {damage}", log.display()));
     }
     // A run that broke off early may have no summary; what happened until then can still be looked at.
-    let summary = std::fs::read(folder.join("summary.json")).ok();
-    let summary = summary.and_then(|bytes| serde_json::from_slice(&bytes).ok()).unwrap_or_default();
+    let summary = input_file::read_text(&folder.join("summary.json"), MOST_TEXT).ok();
+    let summary = summary.and_then(|text| serde_json::from_str(&text).ok()).unwrap_or_default();
     let cannot =
         |file: &Path, error: &dyn std::fmt::Display| Failure::Fault(format!("{}: {error}", file.display()));
 
     let file = folder.join(REPORT_FILE);
     let page = page::page(&setup, &recording, &summary)?;
-    std::fs::write(&file, page).map_err(|error| cannot(&file, &error))?;
+    output_file::write(&file, page).map_err(|error| cannot(&file, &error))?;
 
     let plots = folder.join(PLOTS_FOLDER);
-    std::fs::create_dir_all(&plots).map_err(|error| cannot(&plots, &error))?;
+    output_file::folder(&plots).map_err(|error| cannot(&plots, &error))?;
     for (name, picture) in pictures::all(&setup, &recording).map_err(Failure::fault)? {
         let file = plots.join(name);
-        std::fs::write(&file, picture.to_png()).map_err(|error| cannot(&file, &error))?;
+        output_file::write(&file, picture.to_png()).map_err(|error| cannot(&file, &error))?;
     }
     Ok(file)
 }

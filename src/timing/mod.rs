@@ -40,6 +40,7 @@ use delmpc_transport::remove_dead_runs;
 use serde::Serialize;
 
 use crate::output::{line, print};
+use crate::output_file;
 use crate::run_folder::claim_or;
 use crate::setup::{FAULT_SCENARIO, Setup, scenario_file, scenario_file_or};
 use crate::supervisor::TIDY_UP;
@@ -140,7 +141,8 @@ pub fn timing(arguments: &TimingArguments) -> Result<Ended, Failure> {
     };
     let json = serde_json::to_string_pretty(&report).map_err(Failure::fault)?;
     let file = folder.join("timing.json");
-    std::fs::write(&file, &json).map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))?;
+    output_file::write(&file, &json)
+        .map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))?;
     pictures::write(&report, &folder)?;
     if arguments.json {
         line(&json)?;
@@ -176,7 +178,8 @@ fn faults(arguments: &TimingArguments) -> Result<Ended, Failure> {
     let Some(trials) = trials else { return Ok(Ended::Interrupted) };
     let json = serde_json::to_string_pretty(&trials).map_err(Failure::fault)?;
     let file = folder.join("faults.json");
-    std::fs::write(&file, &json).map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))?;
+    output_file::write(&file, &json)
+        .map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))?;
     if arguments.json {
         line(&json)?;
     } else {

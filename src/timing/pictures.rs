@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
+use crate::output_file;
 use crate::report::canvas::{Align, Canvas, Colour, Text};
 use crate::report::colours::{DASH, GRID, INK, PALETTE, SOFT, WHITE};
 use crate::timing::TimingReport;
@@ -115,7 +116,7 @@ pub fn write(report: &TimingReport, folder: &Path) -> Result<(), Failure> {
         picture.draw(&mut svg);
         for (suffix, content) in [("png", canvas.to_png()), ("svg", svg.finish().into_bytes())] {
             let file = folder.join(format!("{}.{suffix}", picture.file));
-            std::fs::write(&file, content)
+            output_file::write(&file, content)
                 .map_err(|error| Failure::Fault(format!("{}: {error}", file.display())))?;
         }
     }

@@ -40,8 +40,11 @@ const WISH_PAUSE: Duration = Duration::from_millis(4);
 /// Most bytes of a request's head, and of a wish.
 const MOST_HEAD: usize = 8192;
 const MOST_WISH: usize = 256;
-/// Rows kept for who comes later: 40 a second, so 25 minutes.
+/// Rows kept for who comes later, the newest: 40 a second, so 25 minutes.
 const MOST_ROWS: usize = 60_000;
+/// Connections taken in a row, and the pause before more are taken: so much of a core a flood of them may cost.
+const MOST_AT_ONCE: usize = 32;
+const BREATH: Duration = Duration::from_millis(2);
 /// Time between two looks for new rows while a connection is silent.
 const LOOK: Duration = Duration::from_millis(15);
 /// A reader that is slower than this is gone.
@@ -52,7 +55,7 @@ const PATIENCE: Duration = Duration::from_secs(3);
 struct Shared {
     page: String,
     port: u16,
-    rows: Mutex<Vec<Arc<str>>>,
+    rows: Mutex<Rows>,
     wish: Mutex<Wish>,
     pipe: PlantPipe,
     connections: AtomicUsize,
@@ -60,6 +63,30 @@ struct Shared {
     streams: AtomicU64,
     opened: AtomicBool,
     ends: AtomicBool,
+}
+
+/// The newest rows.
+#[derive(Debug, Default)]
+struct Rows {
+    kept: VecDeque<Arc<str>>,
+    /// How many there were before these.
+    before: usize,
+}
+
+impl Rows {
+    fn push(&mut self, row: Arc<str>) {
+        if self.kept.len() == MOST_ROWS {
+            self.kept.pop_front();
+            self.before += 1;
+        }
+        self.kept.push_back(row);
+    }
+
+    /// The row of this number, or the first one after it that is still there, and its number.
+    fn from(&self, number: usize) -> Option<(usize, Arc<str>)> {
+        let number = number.max(self.before);
+        self.kept.get(number - self.before).map(|row| (number, row.clone()))
+    }
 }
 
 /// The server.
@@ -107,10 +134,7 @@ impl Server {
 
     /// Sends a row to all who listen.
     pub fn publish(&self, row: String) {
-        let mut rows = held(&self.shared.rows);
-        if rows.len() < MOST_ROWS {
-            rows.push(row.into());
-        }
+        held(&self.shared.rows).push(row.into());
     }
 
     /// With what force a person pulls now (N).
@@ -161,12 +185,13 @@ enum Head {
 fn accept_all(listener: &TcpListener, shared: &Arc<Shared>) {
     let mut half_open = VecDeque::with_capacity(MOST_HALF_OPEN + 1);
     while !shared.ends.load(Ordering::Relaxed) {
-        let accepted = listener.accept();
-        let idle = accepted.is_err();
-        if let Ok((stream, _)) = accepted
-            && stream.set_nonblocking(true).is_ok()
-        {
-            half_open.push_back(HalfOpen { stream, since: Instant::now() });
+        let mut idle = true;
+        for _ in 0..MOST_AT_ONCE {
+            let Ok((stream, _)) = listener.accept() else { break };
+            idle = false;
+            if stream.set_nonblocking(true).is_ok() {
+                half_open.push_back(HalfOpen { stream, since: Instant::now() });
+            }
             if half_open.len() > MOST_HALF_OPEN {
                 half_open.pop_front(); // dropped: closed
             }
@@ -181,9 +206,7 @@ fn accept_all(listener: &TcpListener, shared: &Arc<Shared>) {
                 Head::Part | Head::None => {}
             }
         }
-        if idle {
-            sleep(LOOK);
-        }
+        sleep(if idle { LOOK } else { BREATH });
     }
 }
 
@@ -253,11 +276,12 @@ fn answer(mut stream: TcpStream, status: &str, kind: &str, body: &str) -> Result
     let mut request = vec![0; MOST_HEAD];
     let _ = std::io::Read::read(&mut stream, &mut request)?;
     let length = body.len();
-    write!(
-        stream,
+    // In one piece: a page that is written bit by bit is sent bit by bit.
+    let whole = format!(
         "HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {length}\r\nCache-Control: no-store\r\n\
          X-Content-Type-Options: nosniff\r\nX-Frame-Options: DENY\r\nConnection: close\r\n\r\n{body}"
-    )?;
+    );
+    stream.write_all(whole.as_bytes())?;
     stream.shutdown(Shutdown::Write)?;
     Ok(())
 }
@@ -297,8 +321,8 @@ fn converse(socket: &mut WebSocket<TcpStream>, shared: &Shared) -> Result<(), Er
         let ends = shared.ends.load(Ordering::Relaxed);
         loop {
             // One at a time, and the next one when this one is out: what waits here is not read, and costs memory.
-            let Some(row) = held(&shared.rows).get(told).cloned() else { break };
-            told += 1;
+            let Some((number, row)) = held(&shared.rows).from(told) else { break };
+            told = number + 1;
             tell(socket, &row)?;
         }
         let newer = shared.streams.load(Ordering::Relaxed).saturating_sub(number + 1);
@@ -416,6 +440,26 @@ mod tests {
             assert!(begin.elapsed() < 10 * HEAD_PATIENCE, "still open");
         }
         server.finish();
+    }
+
+    #[test]
+    fn however_long_a_run_is_the_newest_rows_are_told_and_memory_is_bounded() {
+        let mut rows = Rows::default();
+        let (last, mut told) = (3 * MOST_ROWS, 0);
+        for number in 0..=last {
+            rows.push(number.to_string().into());
+            let (number_told, row) = rows.from(told).unwrap();
+            assert_eq!(
+                (number_told, &*row),
+                (number, &*number.to_string()),
+                "a page that follows misses a row"
+            );
+            told = number_told + 1;
+            assert_eq!(rows.from(told), None);
+        }
+        assert_eq!(rows.kept.len(), MOST_ROWS);
+        // Who comes late gets what is kept.
+        assert_eq!(rows.from(0).unwrap().0, last + 1 - MOST_ROWS);
     }
 
     #[test]

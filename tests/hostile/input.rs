@@ -30,7 +30,14 @@ fn pipes_and_devices_are_refused_and_not_waited_for() {
     std::fs::remove_file(scratch.file("lamp.toml")).unwrap();
     assert!(Command::new("mkfifo").arg(scratch.file("lamp.toml")).status().unwrap().success());
     delmpc(&["model", &scratch.file("lamp.urdf")]).assert(2, &["not a regular file"]);
-    delmpc(&["model", "/dev/zero"]).assert(2, &[]);
+    delmpc(&["init", &pipe]).assert(2, &["it is no plain file"]);
+    for command in ["check", "plan", "push-map", "timing"] {
+        delmpc(&[command, &pipe]).assert(2, &["not a regular file"]);
+    }
+    delmpc(&["plan", "--check", &pipe, &scratch.file("lamp.urdf")]).assert(2, &[]);
+    for command in ["model", "init", "check", "run"] {
+        delmpc(&[command, "/dev/zero"]).assert(2, &[]);
+    }
     delmpc(&["model", scratch.path().to_str().unwrap()]).assert(2, &[]);
     for name in ["scenario.toml", "log.mcap"] {
         let run = Scratch::new("pipe-run");

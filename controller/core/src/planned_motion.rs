@@ -62,7 +62,9 @@ impl PlannedMotion {
         let JointMotion { times, q, rate, torque } = motion;
         let stages = times.len().saturating_sub(1);
         if stages == 0 || q.len() != times.len() || rate.len() != times.len() || torque.len() != stages {
-            return refuse("a planned motion needs two times or more, positions and rates for each, torques between them");
+            return refuse(
+                "a planned motion needs two times or more, positions and rates for each, torques between them",
+            );
         }
         if times[0] != 0.0 || times.windows(2).any(|pair| pair[1] - pair[0] < 1e-6) {
             return refuse("the times of a planned motion begin at 0 and rise");
@@ -159,7 +161,12 @@ impl Hermite {
         let (t2, t3) = (t * t, t * t * t);
         let slope = 6.0 * (t2 - t) / length;
         Self {
-            value: [1.0 - 3.0 * t2 + 2.0 * t3, 3.0 * t2 - 2.0 * t3, length * (t - 2.0 * t2 + t3), length * (t3 - t2)],
+            value: [
+                1.0 - 3.0 * t2 + 2.0 * t3,
+                3.0 * t2 - 2.0 * t3,
+                length * (t - 2.0 * t2 + t3),
+                length * (t3 - t2),
+            ],
             rate: [slope, -slope, 1.0 - 4.0 * t + 3.0 * t2, 3.0 * t2 - 2.0 * t],
         }
     }
@@ -188,7 +195,8 @@ impl JointMotion {
     /// [`ControlError::Model`] when a row has no such joint.
     pub fn in_order(&self, from: &[usize]) -> Result<Self, ControlError> {
         let reorder = |rows: &[Vec<f64>]| {
-            let row = |row: &Vec<f64>| from.iter().map(|j| row.get(*j).copied()).collect::<Option<Vec<f64>>>();
+            let row =
+                |row: &Vec<f64>| from.iter().map(|j| row.get(*j).copied()).collect::<Option<Vec<f64>>>();
             rows.iter().map(row).collect::<Option<Vec<_>>>()
         };
         match (reorder(&self.q), reorder(&self.rate), reorder(&self.torque)) {

@@ -9,6 +9,9 @@ use thread_priority::{
     set_thread_priority_and_policy, thread_native_id, thread_schedule_policy,
 };
 
+/// The smallest real-time priority.
+const LEAST_PRIORITY: u8 = 1;
+
 /// Binds the calling thread to a core, raises it to SCHED_FIFO and keeps all memory in RAM, as far as asked and permitted. Returns a
 /// warning for everything refused.
 ///
@@ -52,6 +55,12 @@ pub fn bind_to_core(core: usize) -> bool {
 /// Whether the calling thread has a real-time priority.
 pub fn is_realtime() -> bool {
     matches!(thread_schedule_policy(), Ok(ThreadSchedulePolicy::Realtime(_)))
+}
+
+/// Puts the calling thread before all programs of ordinary priority, and after every loop with a real-time priority of its own; says whether
+/// that was permitted. For work that has to be done soon, but not in time.
+pub fn go_before_ordinary_programs() -> bool {
+    raise_priority(LEAST_PRIORITY)
 }
 
 fn raise_priority(priority: u8) -> bool {

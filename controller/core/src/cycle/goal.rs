@@ -110,11 +110,15 @@ impl Controller {
     /// [`ControlError::Model`] without a reach, for a motion that does not fit the robot, and for one that takes another time.
     pub fn follow(&mut self, motion: &JointMotion) -> Result<(), ControlError> {
         let Some((reach, goal)) = &mut self.reference.reach else {
-            return Err(ControlError::Model { reason: "a planned motion needs a reach: when it begins, and its ball" });
+            return Err(ControlError::Model {
+                reason: "a planned motion needs a reach: when it begins, and its ball",
+            });
         };
         let planned = PlannedMotion::new(&self.model, motion)?;
         if (planned.duration_s() - reach.deadline_s).abs() > SAME_TIME_S {
-            return Err(ControlError::Model { reason: "a planned motion takes as long as the reach has until its deadline" });
+            return Err(ControlError::Model {
+                reason: "a planned motion takes as long as the reach has until its deadline",
+            });
         }
         goal.clone_from(planned.end());
         self.hand_distance_left_m = (goal.hand - Vector3::from(reach.ball_m)).norm();

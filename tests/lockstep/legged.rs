@@ -1,5 +1,5 @@
 //! Robots on several feet and on their way, lockstep, noise and delay as in the scenarios. The figures of many seeds:
-//! `cargo test --release --test legged -- --ignored --nocapture`.
+//! `cargo test --release --test lockstep legged -- --ignored --nocapture`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 use std::path::Path;

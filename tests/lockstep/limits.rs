@@ -1,5 +1,5 @@
 //! How far the balance carries: reaches that no naive motion manages, models that are wrong, pushes at 60 % of the limit under such a
-//! model. The whole campaign: `cargo test --release --test limits -- --ignored`.
+//! model. The whole campaign: `cargo test --release --test lockstep limits -- --ignored`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 use std::path::PathBuf;

@@ -3,7 +3,7 @@
 //! `vectors/*.json` were solved by a prototype in Python with its own mechanics.
 #![allow(clippy::unwrap_used, reason = "helpers of tests: what fails here is a failed test")]
 
-mod common;
+use crate::common;
 
 use std::path::PathBuf;
 

@@ -1,6 +1,6 @@
 //! Every fault of messages in the project's fault scenario, each in a run of its own: which rung of the ladder it leads to, and that the robot
 //! stands. The faults of processes need real time and minutes: `delmpc timing --faults`, or
-//! `cargo test --test faults -- --ignored`; the quickest of them are in `two_processes`.
+//! `cargo test --test lockstep faults -- --ignored`; the quickest of them are in `two_processes`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 use std::path::Path;

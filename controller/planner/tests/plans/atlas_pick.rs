@@ -1,7 +1,7 @@
 //! Atlas on its right foot fetches a ball: every constraint at the nodes and, by a fine integration, between them.
 #![allow(clippy::unwrap_used, reason = "helpers of tests: what fails here is a failed test")]
 
-mod common;
+use crate::common;
 
 use delmpc_planner::execution::execute;
 use delmpc_planner::planner::{Planned, Search, plan};

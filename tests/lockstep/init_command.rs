@@ -4,9 +4,8 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
 use std::path::PathBuf;
-mod made_up;
 
-use made_up::delmpc;
+use crate::made_up::{self, delmpc};
 
 /// A link: mass, where its mass centre is below its joint, what it collides with.
 fn link(text: &mut String, name: &str, mass: f64, below: f64, shape: &str) {

@@ -1,7 +1,7 @@
 //! LittleDog walks over two gaps in space; nobody names a gait.
 #![allow(clippy::unwrap_used, reason = "helpers of tests: what fails here is a failed test")]
 
-mod common;
+use crate::common;
 
 use delmpc_planner::planner::{Planned, Search, plan};
 

@@ -1,5 +1,5 @@
 //! The main scenario on ground that leans or gives, from starts that are off, with sensors that are biased: lockstep, noise and delay as
-//! in the scenario. The whole campaign of figures: `cargo test --release --test feeling -- --ignored --nocapture`.
+//! in the scenario. The whole campaign of figures: `cargo test --release --test lockstep feeling -- --ignored --nocapture`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 use std::path::Path;

@@ -1,7 +1,7 @@
 //! Spring Flamingo jumps over a box 0.16 m high; nobody names a contact mode.
 #![allow(clippy::unwrap_used, reason = "helpers of tests: what fails here is a failed test")]
 
-mod common;
+use crate::common;
 
 use delmpc_planner::planner::{Search, plan};
 

@@ -3,9 +3,8 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
 use std::path::{Path, PathBuf};
-mod made_up;
 
-use made_up::delmpc;
+use crate::made_up::{self, delmpc};
 
 /// A link of a mass whose centre is so far below (above: negative) its joint, with a shape.
 fn link(text: &mut String, name: &str, mass: f64, below: f64, size: f64, shape: &str) {

@@ -1,7 +1,7 @@
 //! Derivatives of the stage and of the barrier function against differences; the chain against a dense solve.
 #![allow(clippy::unwrap_used, reason = "helpers of tests: what fails here is a failed test")]
 
-mod common;
+use crate::common;
 
 use delmpc_planner::barrier::Barrier;
 use delmpc_planner::contact_law::Homotopy;
