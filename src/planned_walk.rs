@@ -22,6 +22,9 @@ use crate::start::levelled;
 const STILL_M: f64 = 2e-3;
 /// A step that goes less far and less high than this is none: the foot stands where it was, m.
 const SMALLEST_STEP_M: f64 = 0.012;
+/// A swing begins later and ends earlier by this part of it, at most by so much, s.
+const OVERLAP_PART: f64 = 0.15;
+const OVERLAP_S: f64 = 0.03;
 /// Step of the difference quotient of the mass centre, s.
 const DIFFERENCE_S: f64 = 1e-5;
 /// Rest before a plan begins, s.
@@ -54,7 +57,8 @@ pub fn planned_walk(plan: &Plan, setup: &Setup) -> Result<(PlannedBase, Vec<Step
             coordinates.update(&moved, robot, &mut kinematics)?;
             Ok(kinematics.mass_centre_of_tree_w(&robot.tree))
         };
-        let (before, after) = (mass_centre(-DIFFERENCE_S).map_err(refuse)?, mass_centre(DIFFERENCE_S).map_err(refuse)?);
+        let (before, after) =
+            (mass_centre(-DIFFERENCE_S).map_err(refuse)?, mass_centre(DIFFERENCE_S).map_err(refuse)?);
         let here = mass_centre(0.0).map_err(refuse)?;
         let from_world = from_world.get_or_insert_with(|| stance_frame(setup, &kinematics).inverse());
         let [yaw, pitch, roll] = [3, 4, 5].map(|k| q[coordinates.base[k]]);
@@ -68,7 +72,11 @@ pub fn planned_walk(plan: &Plan, setup: &Setup) -> Result<(PlannedBase, Vec<Step
         });
         for (foot, places) in feet.iter().zip(&mut places) {
             let centre = kinematics.link_poses_w()[foot.body].transform_point(&foot.centre);
-            places.push(from_world.transform_point(&Vector3::new(centre.x, centre.y, centre.z - foot.radius)));
+            places.push(from_world.transform_point(&Vector3::new(
+                centre.x,
+                centre.y,
+                centre.z - foot.radius,
+            )));
         }
     }
     let times: Vec<f64> = plan.t.iter().map(|t| t + begin_s).collect();
@@ -90,10 +98,14 @@ impl Coordinates {
     fn of(plan: &Plan, robot: &RobotModel) -> Result<Self, String> {
         let find = |name: &str| {
             let place = plan.coordinates.iter().position(|coordinate| coordinate == name);
-            place.ok_or_else(|| format!("plan {}: it has no coordinate `{name}`: it is of another robot", plan.name))
+            place.ok_or_else(|| {
+                format!("plan {}: it has no coordinate `{name}`: it is of another robot", plan.name)
+            })
         };
         let mut base = [0; 6];
-        for (at, name) in base.iter_mut().zip(["base_x", "base_y", "base_z", "base_yaw", "base_pitch", "base_roll"]) {
+        for (at, name) in
+            base.iter_mut().zip(["base_x", "base_y", "base_z", "base_yaw", "base_pitch", "base_roll"])
+        {
             *at = find(name)?;
         }
         let joints = robot.joint_names.iter().map(|name| find(name)).collect::<Result<_, _>>()?;
@@ -110,11 +122,15 @@ impl Coordinates {
 }
 
 /// Orientation of yaw, pitch, roll, and the angular velocity of their rates in the turned axes.
-fn attitude([yaw, pitch, roll]: [f64; 3], [yaw_rate, pitch_rate, roll_rate]: [f64; 3]) -> (Matrix3<f64>, Vector3<f64>) {
+fn attitude(
+    [yaw, pitch, roll]: [f64; 3],
+    [yaw_rate, pitch_rate, roll_rate]: [f64; 3],
+) -> (Matrix3<f64>, Vector3<f64>) {
     let about = |axis, angle| *Rotation3::from_axis_angle(&axis, angle).matrix();
     let (turn_y, turn_x) = (about(Vector3::y_axis(), pitch), about(Vector3::x_axis(), roll));
     let orientation = about(Vector3::z_axis(), yaw) * turn_y * turn_x;
-    let spin_b = turn_x.tr_mul(&(turn_y.tr_mul(&Vector3::new(0.0, 0.0, yaw_rate)) + Vector3::new(0.0, pitch_rate, 0.0)))
+    let spin_b = turn_x
+        .tr_mul(&(turn_y.tr_mul(&Vector3::new(0.0, 0.0, yaw_rate)) + Vector3::new(0.0, pitch_rate, 0.0)))
         + Vector3::new(roll_rate, 0.0, 0.0);
     (orientation, spin_b)
 }
@@ -134,7 +150,10 @@ fn feet_of(robot: &RobotModel, plan: &Plan) -> Result<Vec<Foot>, String> {
             Some(Foot { body: contact.body?, centre: contact.position, radius: contact.radius })
         });
         foot.ok_or_else(|| {
-            format!("plan {}: sole `{}` is not one sphere: plans of flat feet are not followed", plan.name, sole.name)
+            format!(
+                "plan {}: sole `{}` is not one sphere: plans of flat feet are not followed",
+                plan.name, sole.name
+            )
         })
     };
     robot.soles.iter().map(of_sole).collect()
@@ -143,8 +162,7 @@ fn feet_of(robot: &RobotModel, plan: &Plan) -> Result<Vec<Foot>, String> {
 /// How much later than planned a foot lifts off, and earlier it lands: a plan may have one foot land as another one lifts off, and a foot that
 /// lands late would leave the robot in the air then.
 fn overlap_s(swing_s: f64) -> f64 {
-    let var = |n: &str, d: f64| std::env::var(n).ok().and_then(|v| v.parse().ok()).unwrap_or(d);
-    (var("OVP", 0.15) * swing_s).min(var("OVS", 0.03))
+    (OVERLAP_PART * swing_s).min(OVERLAP_S)
 }
 
 /// The steps of a foot from its places at the plan's boundaries.

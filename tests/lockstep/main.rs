@@ -21,6 +21,7 @@ mod made_up;
 mod own_robot;
 mod person;
 mod plan_command;
+mod planned_motion;
 mod prediction;
 mod unsafe_code;
 mod watchdog;

@@ -307,7 +307,9 @@ impl LeggedController {
             }
             Motion::Planned(base, steps) => {
                 if !lay_out(steps, &mut self.schedule) {
-                    return Err(ControlError::Model { reason: "the planned steps do not fit one after the other" });
+                    return Err(ControlError::Model {
+                        reason: "the planned steps do not fit one after the other",
+                    });
                 }
                 aim.planned = Some(base.clone());
             }

@@ -471,7 +471,8 @@ mod tests {
         };
         for tangents in [1, 2] {
             for (touchdown_speed, sliding) in [(None, true), (Some(1.5), true), (None, false)] {
-                let law = LawConstants { tangents, friction: 0.7, sliding, half_stage_s: 0.04, touchdown_speed };
+                let law =
+                    LawConstants { tangents, friction: 0.7, sliding, half_stage_s: 0.04, touchdown_speed };
                 check(law, &terrain);
                 check(law, &Terrain::flat());
             }

@@ -120,8 +120,17 @@ impl Problem {
     /// # Errors
     /// [`PlanError`] for a robot that the node recursions do not handle or numbers out of range.
     pub fn new(blueprint: Blueprint) -> Result<Self, PlanError> {
-        let Blueprint { robot, terrain, friction, sliding, stages, horizon_s, clearance, touchdown_speed, standing } =
-            blueprint;
+        let Blueprint {
+            robot,
+            terrain,
+            friction,
+            sliding,
+            stages,
+            horizon_s,
+            clearance,
+            touchdown_speed,
+            standing,
+        } = blueprint;
         if stages < 2 {
             return Err(PlanError::OutOfRange {
                 key: "plan.stages",

@@ -91,9 +91,10 @@ fn hermite(t: f64, length: f64, [p, v, q, w]: [&Vector3<f64>; 4]) -> [Vector3<f6
     let value = p * (1.0 - 3.0 * t2 + 2.0 * t3)
         + q * (3.0 * t2 - 2.0 * t3)
         + (v * (t - 2.0 * t2 + t3) + w * (t3 - t2)) * length;
-    let rate = (p - q) * (6.0 * (t2 - t) / length) + v * (1.0 - 4.0 * t + 3.0 * t2) + w * (3.0 * t2 - 2.0 * t);
-    let change =
-        (p - q) * ((12.0 * t - 6.0) / (length * length)) + (v * (6.0 * t - 4.0) + w * (6.0 * t - 2.0)) / length;
+    let rate =
+        (p - q) * (6.0 * (t2 - t) / length) + v * (1.0 - 4.0 * t + 3.0 * t2) + w * (3.0 * t2 - 2.0 * t);
+    let change = (p - q) * ((12.0 * t - 6.0) / (length * length))
+        + (v * (6.0 * t - 4.0) + w * (6.0 * t - 2.0)) / length;
     [value, rate, change]
 }
 
