@@ -69,6 +69,8 @@ pub fn planned_walk(plan: &Plan, setup: &Setup) -> Result<(PlannedBase, Vec<Step
             mass_centre_velocity_w: from_world.rotation * (after - before) / (2.0 * DIFFERENCE_S),
             orientation: from_world.rotation * orientation,
             spin_b,
+            q: coordinates.joints.iter().map(|k| q[*k]).collect(),
+            rate: coordinates.joints.iter().map(|k| v[*k]).collect(),
         });
         for (foot, places) in feet.iter().zip(&mut places) {
             let centre = kinematics.link_poses_w()[foot.body].transform_point(&foot.centre);

@@ -352,6 +352,10 @@ impl MotionReference {
                 FootPhase::Swing(swinging) => swing_place(&swinging, swing, time_s),
             };
         }
+        // Where a leg is stretched it could as well bend the other way.
+        if let Some(planned) = &aim.planned {
+            planned.joints_at(time_s, &mut target.state.q);
+        }
         for _ in 0..ROUNDS {
             let pose = target.state.base_pose_w();
             legs.solve(model, &pose, &target.feet, &mut target.state.q, ITERATIONS)?;

@@ -1,7 +1,7 @@
-//! The motion of base and mass centre as a plan has it: read at any time between its boundaries.
+//! The motion of base, mass centre and joints as a plan has it: read at any time between its boundaries.
 //!
 //! ```text
-//! c(t)   cubic Hermite polynomial of mass centre and its velocity at both ends, error O(Δt⁴)
+//! c(t), q(t)   cubic Hermite polynomials of mass centre and joints with their velocities at both ends, error O(Δt⁴)
 //! R(t) = R_a exp(r(t))   r: the same through 0 and log(R_aᵀ R_b), with the spins at both ends (body axes) as its rates
 //! ```
 //!
@@ -12,8 +12,8 @@ use alloc::vec::Vec;
 use delmpc_mechanics::spatial::{exp_rotation, log_rotation};
 use nalgebra::{Matrix3, Vector3};
 
-/// Base and mass centre at a boundary of the plan.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// Base, mass centre and joints at a boundary of the plan.
+#[derive(Clone, Debug, PartialEq)]
 pub struct BaseNode {
     /// Time, s.
     pub time_s: f64,
@@ -25,6 +25,10 @@ pub struct BaseNode {
     pub orientation: Matrix3<f64>,
     /// Angular velocity of the base in its axes, rad/s.
     pub spin_b: Vector3<f64>,
+    /// Joints, rad or m, in the order of the robot.
+    pub q: Vec<f64>,
+    /// Their velocities, rad/s or m/s.
+    pub rate: Vec<f64>,
 }
 
 /// Base and mass centre at a time.
@@ -45,10 +49,12 @@ pub struct PlannedBase {
 }
 
 impl PlannedBase {
-    /// Of two or more boundaries whose times rise; `None` else.
+    /// Of two or more boundaries whose times rise, with as many joints each; `None` else.
     pub fn new(nodes: Vec<BaseNode>) -> Option<Self> {
         let rises = nodes.windows(2).all(|pair| pair[1].time_s - pair[0].time_s > 1e-6);
-        (nodes.len() >= 2 && rises).then_some(Self { nodes })
+        let joints = nodes.first().map_or(0, |node| node.q.len());
+        let fits = nodes.iter().all(|node| node.q.len() == joints && node.rate.len() == joints);
+        (nodes.len() >= 2 && rises && fits).then_some(Self { nodes })
     }
 
     /// The first boundary.
@@ -68,9 +74,9 @@ impl PlannedBase {
             orientation: node.orientation,
             spin_b: Vector3::zeros(),
         };
-        let after = self.nodes.partition_point(|node| node.time_s <= time_s);
-        let (Some(a), Some(b)) = (after.checked_sub(1).map(|k| &self.nodes[k]), self.nodes.get(after)) else {
-            return resting(if after == 0 { self.begin() } else { self.end() });
+        let (a, b) = match self.between(time_s) {
+            Between::Rest(node) => return resting(node),
+            Between::Nodes(a, b) => (a, b),
         };
         let length = b.time_s - a.time_s;
         let t = (time_s - a.time_s) / length;
@@ -81,6 +87,42 @@ impl PlannedBase {
             mass_centre_w: hermite(t, length, ends),
             orientation: a.orientation * exp_rotation(&angle),
             spin_b: spin,
+        }
+    }
+}
+
+/// What a time lies between.
+enum Between<'a> {
+    /// Before the first boundary or after the last one.
+    Rest(&'a BaseNode),
+    /// Two boundaries.
+    Nodes(&'a BaseNode, &'a BaseNode),
+}
+
+impl PlannedBase {
+    fn between(&self, time_s: f64) -> Between<'_> {
+        let after = self.nodes.partition_point(|node| node.time_s <= time_s);
+        match (after.checked_sub(1).map(|k| &self.nodes[k]), self.nodes.get(after)) {
+            (Some(a), Some(b)) => Between::Nodes(a, b),
+            (None, _) => Between::Rest(self.begin()),
+            _ => Between::Rest(self.end()),
+        }
+    }
+
+    /// The joints at a time (s). No allocation.
+    pub fn joints_at(&self, time_s: f64, q: &mut [f64]) {
+        match self.between(time_s) {
+            Between::Rest(node) => q.copy_from_slice(&node.q),
+            Between::Nodes(a, b) => {
+                let length = b.time_s - a.time_s;
+                let t = (time_s - a.time_s) / length;
+                let (t2, t3) = (t * t, t * t * t);
+                for (j, q) in q.iter_mut().enumerate() {
+                    *q = a.q[j] * (1.0 - 3.0 * t2 + 2.0 * t3)
+                        + b.q[j] * (3.0 * t2 - 2.0 * t3)
+                        + (a.rate[j] * (t - 2.0 * t2 + t3) + b.rate[j] * (t3 - t2)) * length;
+                }
+            }
         }
     }
 }
@@ -112,6 +154,8 @@ mod tests {
             mass_centre_velocity_w: Vector3::new(3.0 * t * t, -1.0, 0.0),
             orientation: exp_rotation(&(axis * t)),
             spin_b: axis,
+            q: vec![t * t, 1.0],
+            rate: vec![2.0 * t, 0.0],
         }
     }
 
@@ -126,6 +170,9 @@ mod tests {
             assert!((acceleration - Vector3::new(6.0 * t, 0.0, 0.0)).norm() < 1e-12, "{t}");
             assert!((point.orientation - exact.orientation).norm() < 1e-14, "{t}");
             assert!((point.spin_b - exact.spin_b).norm() < 1e-13, "{t}");
+            let mut q = [0.0; 2];
+            planned.joints_at(t, &mut q);
+            assert!((q[0] - t * t).abs() < 1e-14 && (q[1] - 1.0).abs() < 1e-14, "{t}");
         }
     }
 
