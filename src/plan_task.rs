@@ -58,6 +58,7 @@ pub fn task_of(urdf: &Path, scenario: &Scenario, settings: &PlanSettings) -> Res
         torque_limit_nm: settings.torque_limit_nm,
         rate_limit: settings.rate_limit_rad_s,
         rate_fraction: settings.rate_fraction,
+        point_load: (settings.point_load > 0.0).then_some(settings.point_load),
         bounds,
         base: BaseBounds {
             attitude_rad: settings.base_attitude_rad,

@@ -119,6 +119,8 @@ pub struct Task {
     pub torque_limit_nm: f64,
     /// Rate limit of driven joints without one, rad/s.
     pub rate_limit: f64,
+    /// Largest part of the weight that a contact point carries in the mean of a stage; none: any. Below a half two or more feet stand.
+    pub point_load: Option<f64>,
     /// Part of the rate limits that the plan may use.
     pub rate_fraction: f64,
     /// Bounds of single coordinates besides the robot's limits: coordinate, lowest, highest.
@@ -175,6 +177,9 @@ impl Task {
         self.scale_rows(&mut problem)?;
         self.add_bounds(&mut problem);
         self.add_cost(&mut problem);
+        if let Some(load) = self.point_load {
+            self.add_load_rows(&mut problem, load);
+        }
         if let Some(limits) = self.execution {
             self.add_execution_rows(&mut problem, limits);
         }
@@ -364,6 +369,18 @@ impl Task {
                 form.push((layout.t(0), -rate));
                 problem.rows.push(LinearRow { form, constant: 0.0 });
             }
+        }
+    }
+
+    /// `load m g Δt - S Σ_α n^α >= 0` for every contact.
+    fn add_load_rows(&self, problem: &mut Problem, load: f64) {
+        let (layout, law) = (problem.layout, problem.law);
+        let per_second = load * self.stages as f64 / self.horizon_s;
+        for i in 0..layout.contacts {
+            let normal = |node: usize| (layout.contact(i) + law.normal(node) - law.first_impulse(), -1.0);
+            let mut form: Vec<(usize, f64)> = (0..3).map(normal).collect();
+            form.extend([(layout.t(1), per_second), (layout.t(0), -per_second)]);
+            problem.rows.push(LinearRow { form, constant: 0.0 });
         }
     }
 

@@ -37,6 +37,8 @@ pub struct PlanSettings {
     pub torque_limit_nm: f64,
     /// Rate limit of joints for which the URDF has none, rad/s.
     pub rate_limit_rad_s: f64,
+    /// Largest part of the weight that a contact point carries in the mean of a stage; 0: any.
+    pub point_load: f64,
     /// Part of the rate limits that the plan may use.
     pub rate_fraction: f64,
     /// Largest pitch, roll and yaw of the base, rad.
@@ -212,6 +214,7 @@ impl Default for PlanSettings {
             torque_fraction: 0.75,
             torque_limit_nm: 60.0,
             rate_limit_rad_s: 15.0,
+            point_load: 0.0,
             rate_fraction: 1.0,
             base_attitude_rad: 0.8,
             base_height_m: [0.0, 10.0],
@@ -263,6 +266,7 @@ impl PlanSettings {
             ("plan.start_speed_m_s", self.start_speed_m_s, -10.0, 10.0),
             ("plan.end_speed_m_s", self.end_speed_m_s, -10.0, 10.0),
             ("plan.friction", self.friction, 0.01, 10.0),
+            ("plan.point_load", self.point_load, 0.0, 100.0),
             ("plan.rate_fraction", self.rate_fraction, 0.01, 1.0),
             ("plan.range_margin", self.range_margin, 0.0, 0.4),
             ("plan.torque_fraction", self.torque_fraction, 0.01, 1.0),
