@@ -47,6 +47,10 @@ use plot::polar_plot;
 const REST_S: f64 = 0.5;
 /// Largest impulse tried (N s).
 const MOST_NS: f64 = 400.0;
+/// Longest push and longest time after it (s), most directions and most seeds that can be meant.
+const MOST_S: f64 = 600.0;
+const MOST_DIRECTIONS: f64 = 3600.0;
+const MOST_SEEDS: f64 = 1e6;
 /// Parts of a limit that have to be survived too.
 const BELOW: [f64; 3] = [0.8, 0.9, 0.95];
 /// Parts of a limit at which shares are told.
@@ -180,11 +184,16 @@ fn trial_setup(arguments: &PushMapArguments) -> Result<Setup, Failure> {
     scenario.success.settle_time_s = scenario.duration_s;
     // The edge of the sole may be used to the full.
     scenario.success.min_cop_margin_m = -1.0;
-    if !(arguments.push_s > 0.0 && arguments.recovery_s > 0.0 && arguments.resolution_ns > 0.0) {
-        return Err(Failure::Input("--push-s, --recovery-s, --resolution-ns: must be positive".to_owned()));
-    }
-    if arguments.directions == 0 || arguments.seeds == 0 {
-        return Err(Failure::Input("--directions, --seeds: at least 1".to_owned()));
+    for (name, value, least, most) in [
+        ("--push-s", arguments.push_s, 1e-3, MOST_S),
+        ("--recovery-s", arguments.recovery_s, 1e-3, MOST_S),
+        ("--resolution-ns", arguments.resolution_ns, 1e-6, MOST_NS),
+        ("--directions", arguments.directions as f64, 1.0, MOST_DIRECTIONS),
+        ("--seeds", arguments.seeds as f64, 1.0, MOST_SEEDS),
+    ] {
+        if !(least..=most).contains(&value) {
+            return Err(Failure::Input(format!("{name} {value}: must lie in {least} .. {most}")));
+        }
     }
     Ok(setup)
 }
@@ -241,7 +250,14 @@ fn search_all(
             scope.spawn(|| {
                 while let Some((index, search)) = take_next(&next, searches) {
                     let trials = |impulse_ns: f64, seed: u64| {
-                        trial(arguments, setup, search, impulse_ns, setup.scenario.seed + seed, stop)
+                        trial(
+                            arguments,
+                            setup,
+                            search,
+                            impulse_ns,
+                            setup.scenario.seed.wrapping_add(seed),
+                            stop,
+                        )
                     };
                     let first_ns = capture_limit(setup, search.angle_rad);
                     match find(arguments, first_ns, &trials, stop) {
@@ -291,7 +307,7 @@ fn find(
     let why_not = |impulse_ns: f64| -> Result<Option<String>, Failure> {
         for seed in 0..arguments.seeds {
             let why = trials(impulse_ns, seed)?;
-            if why.is_some() {
+            if why.is_some() || stop.is_set() {
                 return Ok(why);
             }
         }
@@ -328,16 +344,16 @@ fn find(
     for (share, part) in shares.iter_mut().zip(SHARES_AT) {
         // All survive the limit and what is below.
         if part > 1.0 || survived == 0.0 {
-            *share = share_of(arguments.seeds, part * survived, trials)?;
+            *share = share_of(arguments.seeds, part * survived, trials, stop)?;
         }
     }
     Ok(Found { limit_ns: survived, shares, failure })
 }
 
 /// Share of the seeds that survive an impulse.
-fn share_of(seeds: u64, impulse_ns: f64, trials: &Trials<'_>) -> Result<f64, Failure> {
+fn share_of(seeds: u64, impulse_ns: f64, trials: &Trials<'_>, stop: &StopFlag) -> Result<f64, Failure> {
     let mut count = 0;
-    for seed in 0..seeds {
+    for seed in (0..seeds).take_while(|_| !stop.is_set()) {
         count += u64::from(trials(impulse_ns, seed)?.is_none());
     }
     Ok(count as f64 / seeds as f64)

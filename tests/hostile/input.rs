@@ -110,6 +110,37 @@ fn keys_that_fit_alone_but_not_together_are_refused_at_once() {
 }
 
 #[test]
+fn counts_and_times_of_a_push_map_that_cannot_be_meant_are_refused() {
+    for change in [
+        ["--directions", "0"],
+        ["--directions", "18446744073709551615"],
+        ["--seeds", "0"],
+        ["--seeds", "18446744073709551615"],
+        ["--push-s", "inf"],
+        ["--push-s", "nan"],
+        ["--recovery-s", "1e300"],
+        ["--resolution-ns", "1e-300"],
+        ["--resolution-ns", "0"],
+    ] {
+        let scratch = Scratch::new("push-map");
+        let out = scratch.file("map");
+        delmpc(&[&["push-map", &lamp("reach.toml"), "--out", &out], &change[..]].concat())
+            .assert(2, &[change[0], "must lie in"]);
+        assert!(!std::path::Path::new(&out).exists());
+    }
+}
+
+#[test]
+fn a_push_map_with_many_seeds_ends_when_it_is_told_to() {
+    let scratch = Scratch::new("push-map-stop");
+    let ended = crate::support::shell(&format!(
+        "$DELMPC push-map $REACH --seeds 1000000 --directions 1 --out {0}/map & sleep 2; kill -TERM $!; wait $!",
+        scratch.path().display()
+    ));
+    assert_ne!(ended.status, Some(0), "{ended:?}");
+}
+
+#[test]
 fn cores_that_are_not_there_are_refused_at_once() {
     let scratch = Scratch::new("cores");
     let out = scratch.file("t");
