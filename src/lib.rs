@@ -32,6 +32,9 @@
 //! | [`log`], [`log_viewer`] | the log of states, commands and truth, and what shows the robot to viewers of logs |
 //! | [`log_queue`], [`log_file`], [`log_command`], [`log_reader`] | its way to the file, the file, commands in it, and its way back |
 //! | [`mod@report`] | the run to look at: `report.html` and pictures of the key plots |
+//! | [`connection`] | what a process that is not ours needs to know of a run |
+//! | [`foreign_plant`], [`foreign_truth`] | a plant of somebody else's: log, figures and verdict of what it tells |
+//! | [`wire`] | the messages as a page and as JSON, from the types |
 //! | [`steering`] | what a person does to a running plant |
 //! | [`view`] | the live page: watch, pull, pause |
 //! | [`tape`] | everything that enters the cycles of a run, kept, and given again |
@@ -45,9 +48,12 @@ pub mod check;
 pub mod cli;
 pub mod colour;
 pub mod completions;
+pub mod connection;
 pub mod controller;
 pub mod drawing;
 pub mod faults;
+pub mod foreign_plant;
+pub mod foreign_truth;
 pub mod init;
 pub mod input_file;
 pub mod keys;
@@ -94,3 +100,4 @@ pub mod timing;
 pub mod truth;
 pub mod verdict;
 pub mod view;
+pub mod wire;

@@ -2,13 +2,16 @@
 
 use std::io::{IsTerminal, Write};
 use std::path::Path;
+use std::sync::PoisonError;
 
 use delmpc_controller_process::stop::StopFlag;
-use delmpc_scenario::Clock;
-use delmpc_transport::remove_dead_runs;
+use delmpc_scenario::{Clock, FaultTarget};
+use delmpc_transport::{RunId, remove_dead_runs};
 
 use crate::cli::{RunArguments, RunOptions};
 use crate::colour::Colour;
+use crate::connection::Connection;
+use crate::foreign_plant::Listener;
 use crate::one_process::run_in_one_process;
 use crate::output::{line, print, say};
 use crate::part::summarize;
@@ -18,7 +21,7 @@ use crate::setup::{Setup, scenario_file};
 use crate::simulated_robot::SimulatedRobot;
 use crate::status_line::StatusLine;
 use crate::summary_table::summary_table;
-use crate::supervisor::{Course, Supervision, TIDY_UP, fresh_run};
+use crate::supervisor::{Course, PlantProgram, Supervision, TIDY_UP, fresh_run};
 use crate::verdict::{Ended, Failure};
 use crate::view::View;
 
@@ -45,7 +48,10 @@ pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
     if !options.one_process {
         // What either process would refuse is refused here, before anything is overwritten or started.
         RobotController::new(&setup)?;
-        SimulatedRobot::new(&setup)?;
+        match &options.plant {
+            None => drop(SimulatedRobot::new(&setup)?),
+            Some(_) => warn_of_what_is_the_plants(&setup),
+        }
     }
     let folder = RunFolder::create(options.out.as_deref(), &scenario.name)?;
     folder.write_inputs(&setup)?;
@@ -113,9 +119,12 @@ fn run_in_two_processes(
         let _ = writeln!(std::io::stderr(), "open {} to begin", opened.address());
     }
     let scenario = folder.file("scenario.toml");
+    let (plant, mut listener) = plant_program(setup, run, options, folder)?;
+    let heard = listener.as_ref().map(Listener::outcome);
     let supervision = Supervision {
         run,
         program: std::env::current_exe().map_err(Failure::fault)?,
+        plant,
         arguments: vec![text(&scenario)?, "--out".to_owned(), text(folder.path())?],
         messages: folder.file("messages.txt"),
         steering: view.as_ref().map(View::pipe),
@@ -130,6 +139,7 @@ fn run_in_two_processes(
     let mut watch = view.as_ref().map(|view| view.watch(setup, run)).transpose()?;
     // What listens to the run goes into the closure, and ends with it: before the run is tidied up.
     let course = supervision.supervise(stop, move |_| {
+        let _listens = &mut listener;
         if let Some(watch) = &mut watch {
             watch.look();
         }
@@ -141,7 +151,32 @@ fn run_in_two_processes(
     if show {
         let _ = write!(std::io::stderr(), "\r\x1b[K");
     }
-    course
+    match heard.map(|heard| heard.lock().unwrap_or_else(PoisonError::into_inner).clone()) {
+        Some(Err(why)) if course == Ok(Course::Finished) => Err(Failure::Fault(why)),
+        _ => course,
+    }
+}
+
+/// Who plays the plant; and who listens to it, when it is not ours.
+fn plant_program(
+    setup: &Setup,
+    run: RunId,
+    options: &RunOptions,
+    folder: &RunFolder,
+) -> Result<(PlantProgram, Option<Listener>), Failure> {
+    let Some(command) = &options.plant else { return Ok((PlantProgram::Ours, None)) };
+    let connection = Connection::new(setup, run, &folder.file("scenario.toml"))?;
+    let file = connection.write(folder.path())?;
+    let environment = connection.environment(&file);
+    let listener = Listener::begin(setup, run, command, folder.path())?;
+    Ok((PlantProgram::Foreign { command: command.clone(), environment }, Some(listener)))
+}
+
+/// Keys of the scenario that our plant would have acted on.
+fn warn_of_what_is_the_plants(setup: &Setup) {
+    if setup.scenario.fault.iter().any(|fault| fault.target == FaultTarget::Command) {
+        say("warning: faults of commands strike within our plant: with --plant they are left out");
+    }
 }
 
 fn text(path: &Path) -> Result<String, Failure> {

@@ -309,7 +309,6 @@ fn config(setup: &Setup, holding: &Holding, start: &Start) -> Result<PlantConfig
         false => ActuatorLimits::NONE,
     });
     let stance = robot.soles.iter().position(|sole| sole.name == scenario.robot.stance.first());
-    let pushes = scenario.push.iter().filter(|push| push.impulse_ns > 0.0);
     Ok(PlantConfig {
         time_step: plant.step_s,
         errors: ModelErrors {
@@ -331,7 +330,7 @@ fn config(setup: &Setup, holding: &Holding, start: &Start) -> Result<PlantConfig
         terrain: terrain(scenario),
         contact: ContactOptions { ground: ground(setup), ..ContactOptions::default() },
         sensors: sensors(setup)?,
-        pushes: pushes.map(|push| made_push(robot, push, start)).collect::<Result<_, _>>()?,
+        pushes: pushes(setup)?,
         watchdog: held_by(holding, &start.q),
         monitor: monitor(setup, stance.unwrap_or(0)),
         seed: scenario.seed,
@@ -448,6 +447,16 @@ fn sensors(setup: &Setup) -> Result<SensorConfig, Failure> {
         noise_scale: settings.noise_scale,
         ..there
     })
+}
+
+/// The pushes of a scenario, in the world.
+///
+/// # Errors
+/// [`Failure::Input`] for a link that is fixed to the world.
+pub fn pushes(setup: &Setup) -> Result<Vec<simulation::Push>, Failure> {
+    let start = setup.start()?;
+    let pushes = setup.scenario.push.iter().filter(|push| push.impulse_ns > 0.0);
+    pushes.map(|push| made_push(&setup.robot, push, &start)).collect()
 }
 
 fn made_push(robot: &RobotModel, push: &PushSettings, start: &Start) -> Result<simulation::Push, Failure> {

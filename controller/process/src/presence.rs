@@ -11,7 +11,7 @@ use rustix::process::{Pid, test_kill_process};
 use crate::clock::monotonic_ns;
 
 /// Time between signs of life.
-const PERIOD_NS: u64 = 20_000_000;
+pub const PERIOD_NS: u64 = 20_000_000;
 
 /// Our own signs of life. They come from the loop that does the work, so that a loop that hangs falls silent.
 #[derive(Debug)]

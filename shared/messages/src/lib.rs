@@ -34,6 +34,7 @@ mod joint_set;
 mod plant_state;
 mod servo_law;
 
+pub use check::UNIT_TOLERANCE;
 pub use command::{Command, FallbackLevel, MAX_SEGMENTS, Segment, StateEstimate, Verdict};
 pub use cycle_report::{ConstraintKind, CycleReport};
 pub use error::MessageError;

@@ -1,0 +1,292 @@
+//! A plant that is not ours: another simulator, a robot. It talks the messages; log, figures and verdict are made here.
+//!
+//! A thread of the supervisor listens: to the truth, which the plant tells after every step without noise, to its states and to the commands.
+//! A plant that tells no truth is judged by its states. What a plant has to do is in `shared/messages/WIRE.md`.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::channel;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{JoinHandle, sleep};
+use std::time::Duration;
+
+use delmpc_controller_process::clock::monotonic_ns;
+use delmpc_controller_process::durations::Durations;
+use delmpc_messages::{Command, PlantState, sensor};
+use delmpc_scenario::Clock;
+use delmpc_transport::{Channel, RunId, RunNode, SharedSubscriber, Subscriber};
+
+use crate::foreign_truth::ForeignTruth;
+use crate::log::{Log, LogHead};
+use crate::log_viewer::LogViewer;
+use crate::metrics::Metrics;
+use crate::output::say;
+use crate::part::{leave_part, message_run_id};
+use crate::run_folder::PLANT_PART;
+use crate::setup::Setup;
+use crate::summary::PlantPart;
+use crate::truth::Truth;
+use crate::verdict::Failure;
+
+/// Sleep while there is nothing to hear: short against the time between two messages of a channel.
+const PAUSE: Duration = Duration::from_micros(50);
+/// States whose sending times are remembered, for the ages of their answers.
+const REMEMBERED: usize = 64;
+
+/// What became of the listening.
+pub type Outcome = Arc<Mutex<Result<(), String>>>;
+
+/// Listens to a run whose plant is somebody else's, until it is dropped: then log and figures are in the run's folder.
+#[derive(Debug)]
+pub struct Listener {
+    thread: Option<JoinHandle<Result<(), String>>>,
+    stop: Arc<AtomicBool>,
+    outcome: Outcome,
+}
+
+impl Listener {
+    /// Begins to listen: when this returns, nothing the plant says will be missed.
+    ///
+    /// # Errors
+    /// [`Failure::Fault`] when shared memory or the log's file cannot be had.
+    pub fn begin(setup: &Setup, run: RunId, command: &str, folder: &Path) -> Result<Self, Failure> {
+        let stop = Arc::new(AtomicBool::new(false));
+        let (ready, is_ready) = channel();
+        let (setup, command, folder) = (setup.clone(), command.to_owned(), folder.to_owned());
+        let stopped = stop.clone();
+        let thread = std::thread::Builder::new()
+            .name("judge".to_owned())
+            .spawn(move || {
+                let mut ear = match Ear::new(&setup, run, &command, folder) {
+                    Ok(ear) => ear,
+                    Err(failure) => return Err(failure.to_string()),
+                };
+                let _ = ready.send(());
+                ear.listen(&stopped).and_then(|()| ear.leave()).map_err(|failure| failure.to_string())
+            })
+            .map_err(Failure::fault)?;
+        let listener = Self { thread: Some(thread), stop, outcome: Arc::new(Mutex::new(Ok(()))) };
+        let outcome = listener.outcome();
+        match is_ready.recv() {
+            Ok(()) => Ok(listener),
+            Err(_) => {
+                drop(listener);
+                let said = outcome.lock().unwrap_or_else(PoisonError::into_inner).clone();
+                Err(Failure::Fault(said.err().unwrap_or_else(|| "nobody listens to the plant".to_owned())))
+            }
+        }
+    }
+
+    /// Where it is told how the listening went, once it is over.
+    pub fn outcome(&self) -> Outcome {
+        self.outcome.clone()
+    }
+}
+
+impl Drop for Listener {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Release);
+        if let Some(thread) = self.thread.take() {
+            let ended = thread.join().unwrap_or_else(|_| Err("who judges the run broke down".to_owned()));
+            *self.outcome.lock().unwrap_or_else(PoisonError::into_inner) = ended;
+        }
+    }
+}
+
+/// What is heard, and what is made of it.
+struct Ear {
+    truths: SharedSubscriber<PlantState>,
+    states: SharedSubscriber<PlantState>,
+    commands: SharedSubscriber<Command>,
+    maker: ForeignTruth,
+    metrics: Metrics,
+    log: Log,
+    truth: Box<Truth>,
+    folder: PathBuf,
+    joint_set_hash: u64,
+    joints: usize,
+    run_id: u64,
+    realtime: bool,
+    /// The plant tells the truth beside its states.
+    tells_truth: bool,
+    any: bool,
+    sent: [(u64, u64); REMEMBERED],
+    ages: Durations,
+    /// Sequence of the last truth, state, command, and how many of each were missed.
+    last: [u64; 3],
+    missed: [u64; 3],
+    refused: u64,
+    watchdog_level_max: u32,
+    /// Wall clock of the first step after the start and of the last one.
+    wall_ns: Option<(u64, u64, u64)>,
+    saw_fall: bool,
+    complained: bool,
+}
+
+impl Ear {
+    fn new(setup: &Setup, run: RunId, command: &str, folder: PathBuf) -> Result<Self, Failure> {
+        let scenario = &setup.scenario;
+        let node = RunNode::open(run, setup.joint_set_hash()).map_err(Failure::fault)?;
+        let joints = setup.robot.joint_names.len();
+        let mut about = crate::plant::about(setup, Some(run));
+        about.insert("plant_command".to_owned(), command.to_owned());
+        about.remove("plant_pid");
+        let files = crate::plant::log_head(setup, run).files;
+        let head = LogHead { about, files, viewer: Some(LogViewer::new(setup)) };
+        let lockstep = scenario.clock == Clock::Lockstep;
+        Ok(Self {
+            truths: node.subscriber(Channel::Truth).map_err(Failure::fault)?,
+            states: node.subscriber(Channel::State).map_err(Failure::fault)?,
+            commands: node.subscriber(Channel::Command).map_err(Failure::fault)?,
+            maker: ForeignTruth::new(setup)?,
+            metrics: Metrics::judged_for(setup)?,
+            log: Log::create(&folder.join("log.mcap"), head, lockstep)?,
+            truth: Box::new(Truth::new(joints as u32)),
+            folder,
+            joint_set_hash: setup.joint_set_hash(),
+            joints,
+            run_id: message_run_id(run, scenario),
+            realtime: !lockstep,
+            tells_truth: false,
+            any: false,
+            sent: [(0, 0); REMEMBERED],
+            ages: Durations::new(),
+            last: [0; 3],
+            missed: [0; 3],
+            refused: 0,
+            watchdog_level_max: 0,
+            wall_ns: None,
+            saw_fall: false,
+            complained: false,
+        })
+    }
+
+    fn listen(&mut self, stop: &AtomicBool) -> Result<(), Failure> {
+        loop {
+            // Asked first: what was sent before is then heard below.
+            let last = stop.load(Ordering::Acquire);
+            let mut news = false;
+            while let Some(told) = self.truths.receive_next().map_err(Failure::fault)?.copied() {
+                (news, self.tells_truth) = (true, true);
+                self.take_truth(&told);
+            }
+            news |= self.take_command()?;
+            if let Some(state) = self.states.receive_latest().map_err(Failure::fault)?.copied() {
+                news = true;
+                // The answer to the state before belongs before this one.
+                self.take_command()?;
+                self.take_state(&state);
+            }
+            if last && !news {
+                return Ok(());
+            }
+            if !news {
+                sleep(PAUSE);
+            }
+        }
+    }
+
+    fn take_truth(&mut self, told: &PlantState) {
+        let valid = told
+            .validate(self.joint_set_hash, self.joints)
+            .and_then(|()| told.header.validate_run::<PlantState>(self.run_id));
+        if let Err(error) = valid {
+            self.refused += 1;
+            if !std::mem::replace(&mut self.complained, true) {
+                say(&format!("warning: the plant's truth is refused, and told so once: {error}"));
+            }
+            return;
+        }
+        let now_ns = monotonic_ns();
+        if self.any && told.time_ns <= self.truth.time_ns {
+            return; // told twice
+        }
+        self.count(0, told.header.sequence);
+        self.wall_ns = match self.wall_ns {
+            None if self.any => Some((now_ns, told.time_ns, now_ns)),
+            Some((first_ns, time_ns, _)) => Some((first_ns, time_ns, now_ns)),
+            None => None,
+        };
+        self.any = true;
+        self.maker.observe(told, &mut self.truth);
+        self.metrics.observe(&self.truth);
+        self.log.truth(&self.truth);
+        self.watchdog_level_max = self.watchdog_level_max.max(self.truth.watchdog_level);
+        if let (false, Some(cause)) = (self.saw_fall, self.maker.fall_cause()) {
+            self.saw_fall = true;
+            self.metrics.set_fall_cause(Some(cause.to_owned()));
+        }
+    }
+
+    fn take_state(&mut self, state: &PlantState) {
+        if !self.tells_truth {
+            let told = PlantState { sensors: state.sensors | known_base(state), ..*state };
+            self.take_truth(&told);
+        }
+        self.count(1, state.header.sequence);
+        let sequence = state.header.sequence;
+        self.sent[sequence as usize % REMEMBERED] = (sequence, state.header.sent_at_ns);
+        self.log.state(self.truth.time_ns, state);
+    }
+
+    fn take_command(&mut self) -> Result<bool, Failure> {
+        let Some(command) = self.commands.receive_latest().map_err(Failure::fault)? else {
+            return Ok(false);
+        };
+        let (sequence, answers) = (command.header.sequence, command.state_sequence);
+        self.log.command(self.truth.time_ns, command);
+        self.metrics.observe_estimate(command);
+        let (of, sent_ns) = self.sent[answers as usize % REMEMBERED];
+        if self.realtime && answers > 1 && of == answers {
+            self.ages.add(monotonic_ns().saturating_sub(sent_ns));
+        }
+        self.count(2, sequence);
+        Ok(true)
+    }
+
+    /// Counts what lies between two messages of a channel that were heard.
+    fn count(&mut self, channel: usize, sequence: u64) {
+        let last = std::mem::replace(&mut self.last[channel], sequence);
+        // In real time who listens sees the latest message of a poll, as everybody does; the truth keeps them all.
+        let every = channel == 0 || !self.realtime;
+        if every && last > 0 && sequence > last + 1 {
+            self.missed[channel] += sequence - last - 1;
+        }
+    }
+
+    fn leave(&mut self) -> Result<(), Failure> {
+        let dropped = std::mem::replace(&mut self.log, Log::none()).finish()?;
+        let missed: u64 = self.missed.iter().sum();
+        if missed > 0 {
+            let [truths, states, commands] = self.missed;
+            say(&format!(
+                "warning: {truths} truths, {states} states and {commands} commands were not heard: the machine gave who judges no time"
+            ));
+        }
+        if !self.any {
+            return Ok(()); // no plant ever spoke: there are no figures
+        }
+        let simulated_s = |from_ns: u64| self.truth.time_ns.saturating_sub(from_ns) as f64 * 1e-9;
+        let factor = self.wall_ns.filter(|(first, _, last)| self.realtime && last > first);
+        let part = PlantPart {
+            robot: self.metrics.figures(),
+            state_to_command_age_p50_s: self.ages.percentile_s(0.5),
+            state_to_command_age_p999_s: self.ages.percentile_s(0.999),
+            plant_step_p50_s: None,
+            plant_real_time_factor: factor
+                .map(|(first, time_ns, last)| simulated_s(time_ns) / ((last - first) as f64 * 1e-9)),
+            plant_pauses: None,
+            log_records_dropped: dropped + missed,
+            commands_refused: self.refused,
+            watchdog_level_max: self.watchdog_level_max,
+        };
+        leave_part(Some(&self.folder), PLANT_PART, &part)
+    }
+}
+
+/// The base is told when its orientation is one.
+fn known_base(state: &PlantState) -> u32 {
+    let is_unit = (state.base_orientation_w.iter().map(|x| x * x).sum::<f64>() - 1.0).abs() < 1e-6;
+    let is_placed = state.base_position_w != [0.0; 3];
+    if is_unit && is_placed { sensor::MOTION_CAPTURE } else { 0 }
+}
