@@ -14,7 +14,7 @@ use delmpc_controller_process::clock::monotonic_ns;
 use delmpc_controller_process::durations::Durations;
 use delmpc_messages::{Command, PlantState, sensor};
 use delmpc_scenario::Clock;
-use delmpc_transport::{Channel, RunId, RunNode, SharedSubscriber, Subscriber};
+use delmpc_transport::{Channel, Payload, RunId, RunNode, SharedSubscriber};
 
 use crate::foreign_truth::ForeignTruth;
 use crate::log::{Log, LogHead};
@@ -93,8 +93,24 @@ impl Drop for Listener {
     }
 }
 
+/// The oldest message of each kind that was heard and not taken yet.
+#[derive(Default)]
+struct Heard {
+    truth: Option<Box<PlantState>>,
+    state: Option<Box<PlantState>>,
+    command: Option<Box<Command>>,
+}
+
+fn hear<T: Payload>(held: &mut Option<Box<T>>, from: &mut SharedSubscriber<T>) -> Result<(), Failure> {
+    if held.is_none() {
+        *held = from.receive_next().map_err(Failure::fault)?.map(|message| Box::new(*message));
+    }
+    Ok(())
+}
+
 /// What is heard, and what is made of it.
 struct Ear {
+    heard: Heard,
     truths: SharedSubscriber<PlantState>,
     states: SharedSubscriber<PlantState>,
     commands: SharedSubscriber<Command>,
@@ -107,6 +123,8 @@ struct Ear {
     joints: usize,
     run_id: u64,
     realtime: bool,
+    /// From a measurement to its sending.
+    delay_ns: u64,
     /// The plant tells the truth beside its states.
     tells_truth: bool,
     any: bool,
@@ -135,9 +153,11 @@ impl Ear {
         let head = LogHead { about, files, viewer: Some(LogViewer::new(setup)) };
         let lockstep = scenario.clock == Clock::Lockstep;
         Ok(Self {
-            truths: node.subscriber(Channel::Truth).map_err(Failure::fault)?,
-            states: node.subscriber(Channel::State).map_err(Failure::fault)?,
-            commands: node.subscriber(Channel::Command).map_err(Failure::fault)?,
+            heard: Heard::default(),
+            truths: node.recorder(Channel::Truth).map_err(Failure::fault)?,
+            states: node.recorder(Channel::State).map_err(Failure::fault)?,
+            commands: node.recorder(Channel::Command).map_err(Failure::fault)?,
+            delay_ns: (scenario.sensors.delay_s * 1e9).round() as u64,
             maker: ForeignTruth::new(setup)?,
             metrics: Metrics::judged_for(setup)?,
             log: Log::create(&folder.join("log.mcap"), head, lockstep)?,
@@ -161,29 +181,42 @@ impl Ear {
         })
     }
 
+    /// Hears and keeps everything in the order in which it happened: the truth of a step, the state that was sent at its end, its answer.
     fn listen(&mut self, stop: &AtomicBool) -> Result<(), Failure> {
         loop {
             // Asked first: what was sent before is then heard below.
             let last = stop.load(Ordering::Acquire);
-            let mut news = false;
-            while let Some(told) = self.truths.receive_next().map_err(Failure::fault)?.copied() {
-                (news, self.tells_truth) = (true, true);
-                self.take_truth(&told);
-            }
-            news |= self.take_command()?;
-            if let Some(state) = self.states.receive_latest().map_err(Failure::fault)?.copied() {
-                news = true;
-                // The answer to the state before belongs before this one.
-                self.take_command()?;
-                self.take_state(&state);
-            }
-            if last && !news {
-                return Ok(());
-            }
-            if !news {
+            if !self.take_next()? {
+                if last {
+                    return Ok(());
+                }
                 sleep(PAUSE);
             }
         }
+    }
+
+    /// Takes what happened first of all that was heard; `false`: there is nothing.
+    fn take_next(&mut self) -> Result<bool, Failure> {
+        // In this order: what was sent before a truth is heard when the truth is.
+        let Heard { truth, state, command } = &mut self.heard;
+        hear(truth, &mut self.truths)?;
+        hear(state, &mut self.states)?;
+        hear(command, &mut self.commands)?;
+        let [_, state_sequence, _] = self.last;
+        if let Some(command) = command.take_if(|command| command.state_sequence <= state_sequence) {
+            self.take_command(&command);
+            return Ok(true);
+        }
+        let until_ns = state.as_ref().map_or(u64::MAX, |state| state.time_ns.saturating_add(self.delay_ns));
+        if let Some(truth) = truth.take_if(|truth| truth.time_ns <= until_ns) {
+            self.tells_truth = true;
+            self.take_truth(&truth);
+        } else if let Some(state) = state.take() {
+            self.take_state(&state);
+        } else {
+            return Ok(false);
+        }
+        Ok(true)
     }
 
     fn take_truth(&mut self, told: &PlantState) {
@@ -229,27 +262,21 @@ impl Ear {
         self.log.state(self.truth.time_ns, state);
     }
 
-    fn take_command(&mut self) -> Result<bool, Failure> {
-        let Some(command) = self.commands.receive_latest().map_err(Failure::fault)? else {
-            return Ok(false);
-        };
-        let (sequence, answers) = (command.header.sequence, command.state_sequence);
+    fn take_command(&mut self, command: &Command) {
         self.log.command(self.truth.time_ns, command);
         self.metrics.observe_estimate(command);
+        let answers = command.state_sequence;
         let (of, sent_ns) = self.sent[answers as usize % REMEMBERED];
         if self.realtime && answers > 1 && of == answers {
             self.ages.add(monotonic_ns().saturating_sub(sent_ns));
         }
-        self.count(2, sequence);
-        Ok(true)
+        self.count(2, command.header.sequence);
     }
 
     /// Counts what lies between two messages of a channel that were heard.
     fn count(&mut self, channel: usize, sequence: u64) {
         let last = std::mem::replace(&mut self.last[channel], sequence);
-        // In real time who listens sees the latest message of a poll, as everybody does; the truth keeps them all.
-        let every = channel == 0 || !self.realtime;
-        if every && last > 0 && sequence > last + 1 {
+        if last > 0 && sequence > last + 1 {
             self.missed[channel] += sequence - last - 1;
         }
     }

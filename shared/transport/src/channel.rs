@@ -20,6 +20,8 @@ pub enum Channel {
 const MAX_SUBSCRIBERS: usize = 8;
 /// Steps of a plant that who judges the run may be late.
 const TRUTHS_KEPT: usize = 1024;
+/// States and commands that who writes a log may be late; plant and controller themselves ask for the latest one.
+const MESSAGES_KEPT: usize = 16;
 /// Who judges the run, and somebody who watches.
 const TRUTH_SUBSCRIBERS: usize = 2;
 
@@ -41,9 +43,13 @@ impl Channel {
         !matches!(self, Self::Heartbeat(_))
     }
 
-    /// Messages a subscriber has waiting at most: the latest one, or of the truth all that a plant makes in a second.
+    /// Messages a subscriber may have waiting at most: of the truth all that a plant makes in a second.
     pub fn buffer_size(self) -> usize {
-        if self == Self::Truth { TRUTHS_KEPT } else { 1 }
+        match self {
+            Self::Truth => TRUTHS_KEPT,
+            Self::State | Self::Command => MESSAGES_KEPT,
+            Self::Heartbeat(_) => 1,
+        }
     }
 
     /// Places for subscribers.

@@ -108,9 +108,26 @@ impl RunNode {
     /// # Errors
     /// As [`Self::publisher`], with at most eight subscribers on a channel.
     pub fn subscriber<T: Payload>(&self, channel: Channel) -> Result<SharedSubscriber<T>, LinkError> {
+        self.subscriber_with_buffer(channel, 1)
+    }
+
+    /// A receiving end that keeps as many messages as the channel has room for: read it by [`SharedSubscriber::receive_next`].
+    ///
+    /// # Errors
+    /// As [`Self::subscriber`].
+    pub fn recorder<T: Payload>(&self, channel: Channel) -> Result<SharedSubscriber<T>, LinkError> {
+        self.subscriber_with_buffer(channel, channel.buffer_size())
+    }
+
+    fn subscriber_with_buffer<T: Payload>(
+        &self,
+        channel: Channel,
+        buffer_size: usize,
+    ) -> Result<SharedSubscriber<T>, LinkError> {
         without_waiting_for_the_lost(self.run, || {
             let service = self.service::<T>(channel)?;
-            self.insist(PORT_PATIENCE, || match service.subscriber_builder().create() {
+            let create = || service.subscriber_builder().buffer_size(buffer_size).create();
+            self.insist(PORT_PATIENCE, || match create() {
                 Ok(port) => Attempt::Done(SharedSubscriber::new(port, channel.name())),
                 Err(SubscriberCreateError::ExceedsMaxSupportedSubscribers) => {
                     Attempt::TryAgain(self.occupied(channel, "subscriber"))
