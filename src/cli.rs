@@ -10,6 +10,7 @@ use crate::init::InitArguments;
 use crate::keys::KeysArguments;
 use crate::model::ModelArguments;
 use crate::plan::PlanArguments;
+use crate::plant_check::PlantCheckArguments;
 use crate::push_map::PushMapArguments;
 use crate::replay::ReplayArguments;
 use crate::report::ReportArguments;
@@ -141,6 +142,12 @@ Examples:
   delmpc wire --json > wire.json                every payload: field, offset, size, type, unit, frame
   delmpc wire --connection configs/scenarios/atlas_one_foot.toml --run-id bench-3";
 
+const PLANT_CHECK_EXAMPLES: &str = "\
+Examples:
+  delmpc plant-check 'python3 examples/mujoco/plant.py'
+  delmpc plant-check './my_plant' my_robot/stand.toml --json
+  delmpc plant-check 'exec delmpc plant $DELMPC_SCENARIO --run-id $DELMPC_RUN_ID --supervised'   our own";
+
 const CHECK_EXAMPLES: &str = "\
 Examples:
   delmpc check configs/scenarios/*.toml
@@ -224,6 +231,12 @@ pub enum Command {
     /// For whoever writes another plant or another controller: services, layouts, codes, duties, and what is refused.
     #[command(after_long_help = WIRE_EXAMPLES)]
     Wire(WireArguments),
+    /// Put a plant of your own through its duties: start, answers, bounds, bad commands, silence, watchdog, end
+    ///
+    /// The plant is started as by `delmpc run --plant`, in lockstep, and asked what shared/messages/WIRE.md demands. Exit status 1 when a
+    /// duty is not met.
+    #[command(after_long_help = PLANT_CHECK_EXAMPLES)]
+    PlantCheck(PlantCheckArguments),
     /// Find the largest push survived in every direction: table, JSON, polar plot
     ///
     /// The robot stands in the scenario's posture and is pushed once, in lockstep; the impulse is found by bisection. Left behind are

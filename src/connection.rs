@@ -59,6 +59,7 @@ impl Connection {
             "message_run_id": hex(message_run_id),
             "joint_set_hash": hex(joint_set_hash),
             "clock": clock,
+            "seed": scenario.seed,
             "scenario": scenario_file,
             "urdf": absolute(&setup.urdf),
             "companion": absolute(&setup.urdf.with_extension("toml")),

@@ -240,11 +240,14 @@ impl Ear {
             Some((first_ns, time_ns, _)) => Some((first_ns, time_ns, now_ns)),
             None => None,
         };
-        self.any = true;
+        let begun = std::mem::replace(&mut self.any, true);
         self.maker.observe(told, &mut self.truth);
         self.metrics.observe(&self.truth);
         self.log.truth(&self.truth);
-        self.watchdog_level_max = self.watchdog_level_max.max(self.truth.watchdog_level);
+        if begun {
+            // Before the first command somebody has to hold the start.
+            self.watchdog_level_max = self.watchdog_level_max.max(self.truth.watchdog_level);
+        }
         if let (false, Some(cause)) = (self.saw_fall, self.maker.fall_cause()) {
             self.saw_fall = true;
             self.metrics.set_fall_cause(Some(cause.to_owned()));

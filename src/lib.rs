@@ -35,6 +35,7 @@
 //! | [`connection`] | what a process that is not ours needs to know of a run |
 //! | [`foreign_plant`], [`foreign_truth`] | a plant of somebody else's: log, figures and verdict of what it tells |
 //! | [`wire`] | the messages as a page and as JSON, from the types |
+//! | [`mod@plant_check`] | the duties of a plant of somebody else's, one by one |
 //! | [`steering`] | what a person does to a running plant |
 //! | [`view`] | the live page: watch, pull, pause |
 //! | [`tape`] | everything that enters the cycles of a run, kept, and given again |
@@ -77,6 +78,7 @@ pub mod part;
 pub mod plan;
 pub mod plan_page;
 pub mod plant;
+pub mod plant_check;
 pub mod plant_process;
 pub mod push_map;
 pub mod replay;

@@ -27,6 +27,7 @@ fn main() -> ExitCode {
         Command::Controller(arguments) => delmpc::controller::controller(&arguments, allocations),
         Command::Check(arguments) => delmpc::check::check(&arguments),
         Command::Keys(arguments) => delmpc::keys::keys(&arguments),
+        Command::PlantCheck(arguments) => delmpc::plant_check::plant_check(&arguments),
         Command::Wire(arguments) => delmpc::wire::wire(&arguments),
         Command::Init(arguments) => delmpc::init::init(&arguments),
         Command::Model(arguments) => delmpc::model::model(&arguments),

@@ -139,6 +139,10 @@ impl<K: CycleClock> Controller for RobotController<K> {
             controller.prepare(&self.clock);
         }
     }
+
+    fn reason_in_words(&self, reason: u32) -> &'static str {
+        delmpc_controller_core::cycle::reason::words(reason)
+    }
 }
 
 /// An error of the controller, with the joint that its index stands for: `joints` has the robot's joint for every one of the controller's.

@@ -1,5 +1,6 @@
 //! The plant of a scenario: the robot with its feet, actuators, sensors and disturbances, standing in its posture.
 
+use delmpc_controller_process::refusals::Refusals;
 use delmpc_mechanics::inverse_dynamics::{InverseDynamicsWorkspace, gravity_force_into};
 use delmpc_mechanics::kinematics::{Configuration, Kinematics};
 use delmpc_mechanics::mass_matrix::{MassMatrixWorkspace, mass_matrix_into};
@@ -7,7 +8,7 @@ use delmpc_mechanics::prelude::{KinematicTree, RigidTransform, State};
 use delmpc_messages::{ClockKind, Command, PlantState};
 use delmpc_plant::prelude as simulation;
 use delmpc_plant::prelude::{
-    ActuatorConfig, ActuatorLimits, AffineLaw, ContactOptions, ContactPoint, FallCause, Foot, FootReport,
+    ActuatorConfig, ActuatorLimits, AffineLaw, CommandRefused, ContactOptions, ContactPoint, FallCause, Foot, FootReport,
     GroundGive, HoldingGains, InertialUnitConfig, ModelErrors, MonitorConfig, PlantConfig, PlantModel,
     SensorConfig, Terrain, TerrainBox, TerrainGap, WatchdogConfig,
 };
@@ -35,6 +36,7 @@ pub struct SimulatedRobot {
     body_names: Vec<String>,
     /// On several feet, or on its way.
     is_legged: bool,
+    refusals: Refusals,
 }
 
 impl SimulatedRobot {
@@ -67,13 +69,25 @@ impl SimulatedRobot {
             clock,
             body_names: robot.body_names.clone(),
             is_legged: setup.is_legged(),
+            refusals: Refusals::default(),
         })
     }
 }
 
 impl Plant for SimulatedRobot {
     fn accept(&mut self, command: &Command) -> bool {
-        self.plant.accept(command).is_ok()
+        let taken = self.plant.accept(command);
+        if let Err(error) = &taken {
+            let kind = match error {
+                CommandRefused::Message(error) => error.code(),
+                CommandRefused::OutOfOrder { .. } => 100,
+                CommandRefused::JumpAhead { .. } => 101,
+                CommandRefused::TooEarly { .. } => 102,
+                _ => 103,
+            };
+            self.refusals.tell(kind, || format!("a command is refused: {error}"));
+        }
+        taken.is_ok()
     }
 
     fn step(&mut self) -> Result<(), String> {

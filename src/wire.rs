@@ -3,6 +3,8 @@
 //! Layouts come from the types ([`layout`]); the prose around the tables is in `src/wire/page.md`.
 
 pub mod layout;
+#[cfg(test)]
+mod servo_vectors;
 
 use std::fmt::Write as _;
 use std::path::PathBuf;

@@ -114,7 +114,7 @@ class Plant:
         self.fell_ns = None
         self.servo = delmpc.Servo(self.n, connection.joint_set_hash, connection["watchdog"])
         self.accept = self.servo.accept
-        self.sensors = Sensors(connection["sensors"], self.n, self.step_s, options.seed)
+        self.sensors = Sensors(connection["sensors"], self.n, self.step_s, connection["seed"] if options.seed is None else options.seed)
         self._read()
 
     def _rotation(self, body):
@@ -225,7 +225,7 @@ def options():
     parser.add_argument("--solref", default="0.002 1", help="contact time constant (s) and damping ratio; MuJoCo's own default: '0.02 1'")
     parser.add_argument("--solimp", default="0.9 0.95 0.001", help="contact impedance")
     parser.add_argument("--impratio", type=float, default=100, help="friction against normal impedance; MuJoCo's own default: 1")
-    parser.add_argument("--seed", type=int, default=1, help="of the sensors' noise")
+    parser.add_argument("--seed", type=int, help="of the sensors' noise; as in the scenario where it is not given")
     return parser.parse_args()
 
 
