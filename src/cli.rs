@@ -310,6 +310,9 @@ pub struct RunOptions {
     /// are as usual.
     #[arg(long, value_name = "COMMAND", conflicts_with_all = ["one_process", "view"])]
     pub plant: Option<String>,
+    /// The controller is this command instead of ours, started in the same way
+    #[arg(long, value_name = "COMMAND", conflicts_with = "one_process")]
+    pub controller: Option<String>,
 }
 
 /// Arguments of `delmpc run`.

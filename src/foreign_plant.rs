@@ -19,7 +19,7 @@ use delmpc_transport::{Channel, Payload, RunId, RunNode, SharedSubscriber};
 use crate::foreign_truth::ForeignTruth;
 use crate::log::{Log, LogHead};
 use crate::log_viewer::LogViewer;
-use crate::metrics::Metrics;
+use crate::metrics::{Metrics, RobotFigures};
 use crate::output::say;
 use crate::part::{leave_part, message_run_id};
 use crate::run_folder::PLANT_PART;
@@ -123,6 +123,7 @@ struct Ear {
     joints: usize,
     run_id: u64,
     realtime: bool,
+    step_ns: u64,
     /// From a measurement to its sending.
     delay_ns: u64,
     /// The plant tells the truth beside its states.
@@ -157,6 +158,7 @@ impl Ear {
             truths: node.recorder(Channel::Truth).map_err(Failure::fault)?,
             states: node.recorder(Channel::State).map_err(Failure::fault)?,
             commands: node.recorder(Channel::Command).map_err(Failure::fault)?,
+            step_ns: ((scenario.plant.step_s * 1e9).round() as u64).max(1),
             delay_ns: (scenario.sensors.delay_s * 1e9).round() as u64,
             maker: ForeignTruth::new(setup)?,
             metrics: Metrics::judged_for(setup)?,
@@ -241,7 +243,7 @@ impl Ear {
             None => None,
         };
         let begun = std::mem::replace(&mut self.any, true);
-        self.maker.observe(told, &mut self.truth);
+        self.maker.observe(told, self.tells_truth, &mut self.truth);
         self.metrics.observe(&self.truth);
         self.log.truth(&self.truth);
         if begun {
@@ -298,8 +300,10 @@ impl Ear {
         }
         let simulated_s = |from_ns: u64| self.truth.time_ns.saturating_sub(from_ns) as f64 * 1e-9;
         let factor = self.wall_ns.filter(|(first, _, last)| self.realtime && last > first);
+        // A plant that tells only its states tells of every cycle, not of every step.
+        let steps = self.truth.time_ns / self.step_ns;
         let part = PlantPart {
-            robot: self.metrics.figures(),
+            robot: RobotFigures { steps, ..self.metrics.figures() },
             state_to_command_age_p50_s: self.ages.percentile_s(0.5),
             state_to_command_age_p999_s: self.ages.percentile_s(0.999),
             plant_step_p50_s: None,

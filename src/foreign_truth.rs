@@ -4,7 +4,7 @@
 //! |---|---|
 //! | mass centre, soles, hand | motion of the base and the joints, by our kinematics |
 //! | pressure point, its margin, friction use | wrench on each foot, above 1 % of the weight |
-//! | slip | way of the sole's material point under the pressure point, along the ground, since the touchdown |
+//! | slip | path of the sole's material point under the pressure point, along the ground, since the touchdown; of a plant that tells no truth, whose noise would add up in a path, how far the sole's origin is from where it touched down |
 //! | tilt | angle between the sole's normal and the ground's |
 //! | fall | mass centre below half its height above the lowest sole, base leaning by a radian from its start, or the plant says so |
 
@@ -32,6 +32,7 @@ struct SoleMemory {
     polygon: Vec<[f64; 2]>,
     pose_w: Option<RigidTransform>,
     touching: bool,
+    touchdown_w: Option<Vector3<f64>>,
     slip_m: f64,
 }
 
@@ -65,6 +66,7 @@ impl ForeignTruth {
             polygon: sole.polygon.iter().map(|corner| (*corner).into()).collect(),
             pose_w: None,
             touching: false,
+            touchdown_w: None,
             slip_m: 0.0,
         });
         Ok(Self {
@@ -88,8 +90,8 @@ impl ForeignTruth {
         self.fell.as_deref()
     }
 
-    /// Takes in a state: without noise and of its own moment.
-    pub fn observe(&mut self, state: &PlantState, truth: &mut Truth) {
+    /// Takes in a state; `exact`: it is without noise, and one of every step.
+    pub fn observe(&mut self, state: &PlantState, exact: bool, truth: &mut Truth) {
         let n = state.n_joints as usize;
         let pose_w = base_pose(state);
         let twist_b = Twist {
@@ -107,7 +109,7 @@ impl ForeignTruth {
         truth.time_ns = state.time_ns;
         truth.watchdog_level = state.watchdog_level;
         truth.status_flags = state.status_flags & !status::FINISHED;
-        self.judge_feet(state, truth);
+        self.judge_feet(state, exact, truth);
         if self.observer.floats() {
             self.judge_fall(&pose_w, state.has_sensor(sensor::MOTION_CAPTURE), truth);
         }
@@ -121,7 +123,7 @@ impl ForeignTruth {
         self.last_ns = state.time_ns;
     }
 
-    fn judge_feet(&mut self, state: &PlantState, truth: &mut Truth) {
+    fn judge_feet(&mut self, state: &PlantState, exact: bool, truth: &mut Truth) {
         let step_s = state.time_ns.saturating_sub(self.last_ns) as f64 * 1e-9;
         truth.feet_touching = 0;
         (truth.sole_tilt_rad, truth.stance_slip_m) = (0.0, 0.0);
@@ -133,13 +135,17 @@ impl ForeignTruth {
             let touching = reading.flags & foot::TOUCHES != 0 || (has_wrench && force.z > 0.0);
             if touching && !memory.touching {
                 memory.slip_m = 0.0;
+                memory.touchdown_w = Some(pose_w.translation);
             }
+            let along_ground = |way: Vector3<f64>| (way - self.normal_w * self.normal_w.dot(&way)).norm();
             let loaded = has_wrench && force.z >= PRESSURE_SHARE * self.weight_n;
             let point = Vector3::new(-reading.torque_s[1] / force.z, reading.torque_s[0] / force.z, 0.0);
             if let (true, true, Some(before_w)) = (loaded, memory.touching, &memory.pose_w) {
-                let way = pose_w.transform_point(&point) - before_w.transform_point(&point);
-                let along = (way - self.normal_w * self.normal_w.dot(&way)).norm();
+                let along = along_ground(pose_w.transform_point(&point) - before_w.transform_point(&point));
                 memory.slip_m += if along > SLIP_SPEED * step_s { along } else { 0.0 };
+            }
+            if let (false, true, Some(touchdown_w)) = (exact, loaded, memory.touchdown_w) {
+                memory.slip_m = along_ground(pose_w.translation - touchdown_w);
             }
             (memory.touching, memory.pose_w) = (touching, Some(pose_w));
             truth.foot_slip_m[index] = memory.slip_m;

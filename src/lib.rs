@@ -29,11 +29,13 @@
 //! | [`drawing`] | a robot in its postures as SVG |
 //! | [`mod@keys`] | every key of a scenario, from the types that read it |
 //! | [`completions`] | what a shell needs to complete our words |
+//! | [`log_ros`] | transforms and joint states as ROS 2 has them |
 //! | [`log`], [`log_viewer`] | the log of states, commands and truth, and what shows the robot to viewers of logs |
 //! | [`log_queue`], [`log_file`], [`log_command`], [`log_reader`] | its way to the file, the file, commands in it, and its way back |
 //! | [`mod@report`] | the run to look at: `report.html` and pictures of the key plots |
 //! | [`connection`] | what a process that is not ours needs to know of a run |
 //! | [`foreign_plant`], [`foreign_truth`] | a plant of somebody else's: log, figures and verdict of what it tells |
+//! | [`foreign_controller`] | a controller of somebody else's: its commands counted |
 //! | [`wire`] | the messages as a page and as JSON, from the types |
 //! | [`mod@plant_check`] | the duties of a plant of somebody else's, one by one |
 //! | [`steering`] | what a person does to a running plant |
@@ -53,6 +55,7 @@ pub mod connection;
 pub mod controller;
 pub mod drawing;
 pub mod faults;
+pub mod foreign_controller;
 pub mod foreign_plant;
 pub mod foreign_truth;
 pub mod init;
@@ -65,6 +68,7 @@ pub mod log_command;
 pub mod log_file;
 pub mod log_queue;
 pub mod log_reader;
+pub mod log_ros;
 mod log_schema;
 pub mod log_viewer;
 pub mod mesh_file;

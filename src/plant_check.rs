@@ -7,7 +7,7 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use delmpc_messages::{Command, PlantState, ProcessState, status};
+use delmpc_messages::{Command, MAX_JOINTS, PlantState, ProcessState, status};
 use delmpc_scenario::Clock;
 use rustix::process::Signal;
 use serde::Serialize;
@@ -126,6 +126,8 @@ fn how(ended: Option<i32>, bench: &Bench) -> String {
     let said = bench.said();
     match ended {
         None => "it did not end".to_owned(),
+        Some(-1) if said.is_empty() => "ended by a signal, no words".to_owned(),
+        Some(-1) => format!("ended by a signal: {said}"),
         Some(status) if said.is_empty() => format!("exit status {status}, no words"),
         Some(status) => format!("exit status {status}: {said}"),
     }
@@ -158,7 +160,11 @@ fn session(mut bench: Bench, duties: &mut Vec<Duty>) -> Result<(), Failure> {
     let ready = bench.peer_becomes(ProcessState::Ready, ANSWER)?;
     let early = bench.state(STILL)?;
     let seen = format!("{:?}; {}", bench.peer_state(), still(early.as_ref()));
-    duties.push(duty("is Ready then, and waits for the supervisor's Running", ready && early.is_none(), seen));
+    duties.push(duty(
+        "is Ready then, and waits for the supervisor's Running",
+        ready && early.is_none(),
+        seen,
+    ));
     bench.order(ProcessState::Running)?;
     let Some(state) = bench.state(ANSWER)? else {
         duties.push(duty("runs", false, format!("no second state; it said: {}", bench.said())));
@@ -172,7 +178,11 @@ fn session(mut bench: Bench, duties: &mut Vec<Duty>) -> Result<(), Failure> {
     let seen = format!("applied_command_sequence {}", state.applied_command_sequence);
     duties.push(duty("applies the command and says which", applied, seen));
     let truths = bench.truths()?;
-    let seen = if truths == 0 { "no: it is judged by its states".to_owned() } else { format!("{truths} truths so far") };
+    let seen = if truths == 0 {
+        "no: it is judged by its states".to_owned()
+    } else {
+        format!("{truths} truths so far")
+    };
     duties.push(Duty { duty: "tells the truth of every step (need not)", met: None, seen });
 
     let Some(state) = torque_duties(&mut bench, state, duties)? else { return broke_off(&bench, duties) };
@@ -202,12 +212,16 @@ fn torque_duties(
 ) -> Result<Option<PlantState>, Failure> {
     let joints = bench.joints();
     let mut plain = bench.holding(&state);
-    plain.gain = [[0.0; 64]; 32];
+    plain.gain = [[0.0; 2 * MAX_JOINTS]; MAX_JOINTS];
     let Some(after) = bench.exchange(&plain, ANSWER)? else { return Ok(None) };
     let wanted = &plain.segments[0].torque;
     let off = (0..joints).map(|joint| (after.applied_torque[joint] - wanted[joint]).abs());
     let off = off.fold(0.0, f64::max);
-    duties.push(duty("gives the feed-forward torque as it is", off < 1e-6, format!("off by {off:.1e} N m at most")));
+    duties.push(duty(
+        "gives the feed-forward torque as it is",
+        off < 1e-6,
+        format!("off by {off:.1e} N m at most"),
+    ));
 
     let mut bounded = bench.holding(&after);
     let bound = bench.small_torque();
@@ -235,14 +249,16 @@ fn refusals(
         ("refuses a command for other joints", |c, _| c.header.joint_set_hash ^= 1),
         ("refuses a command of another run", |c, _| c.header.run_id ^= 1),
         ("refuses a command that ran out before it came", |c, now| c.valid_until_ns = now.saturating_sub(1)),
-        ("refuses bounds with nothing between them", |c, _| c.segments[0].torque_lower[0] = 1e6),
+        ("refuses bounds with nothing between them", |c, _| {
+            (c.segments[0].torque_lower[0], c.segments[0].torque_upper[0]) = (1.0, -1.0);
+        }),
     ];
     for (name, damage) in BAD {
         // A good one first, so that one is in force.
         let good = bench.holding(&state);
         let Some(before) = bench.exchange(&good, ANSWER)? else { return Ok(None) };
         let mut bad = bench.holding(&before);
-        bad.gain = [[0.0; 64]; 32];
+        bad.gain = [[0.0; 2 * MAX_JOINTS]; MAX_JOINTS];
         bad.valid_from_ns = bad.valid_from_ns.min(before.time_ns.saturating_sub(2));
         damage(&mut bad, before.time_ns);
         bench.send(&bad)?;
@@ -257,7 +273,8 @@ fn refusals(
         };
         let in_force = after.applied_command_sequence;
         let refused = in_force >= good.header.sequence && in_force != bad.header.sequence;
-        let torques_are_numbers = after.applied_torque[..bench.joints()].iter().all(|torque| torque.is_finite());
+        let torques_are_numbers =
+            after.applied_torque[..bench.joints()].iter().all(|torque| torque.is_finite());
         let seen = format!("command {in_force} is in force, sent was {}", bad.header.sequence);
         duties.push(duty(name, refused && torques_are_numbers, seen));
         state = after;
@@ -315,7 +332,11 @@ fn watchdog(bench: &mut Bench, state: PlantState, duties: &mut Vec<Duty>) -> Res
     let fell = if state.has_status(status::FELL) { ", then it fell" } else { "" };
     let seen = format!("levels {levels:?}{fell}");
     duties.push(duty("goes down the watchdog's levels when commands cease", down, seen));
-    duties.push(duty("sets WATCHDOG in its status meanwhile", flagged && !levels.is_empty(), format!("{flagged}")));
+    duties.push(duty(
+        "sets WATCHDOG in its status meanwhile",
+        flagged && !levels.is_empty(),
+        format!("{flagged}"),
+    ));
     Ok(())
 }
 

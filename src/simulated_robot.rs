@@ -8,9 +8,9 @@ use delmpc_mechanics::prelude::{KinematicTree, RigidTransform, State};
 use delmpc_messages::{ClockKind, Command, PlantState};
 use delmpc_plant::prelude as simulation;
 use delmpc_plant::prelude::{
-    ActuatorConfig, ActuatorLimits, AffineLaw, CommandRefused, ContactOptions, ContactPoint, FallCause, Foot, FootReport,
-    GroundGive, HoldingGains, InertialUnitConfig, ModelErrors, MonitorConfig, PlantConfig, PlantModel,
-    SensorConfig, Terrain, TerrainBox, TerrainGap, WatchdogConfig,
+    ActuatorConfig, ActuatorLimits, AffineLaw, CommandRefused, ContactOptions, ContactPoint, FallCause, Foot,
+    FootReport, GroundGive, HoldingGains, InertialUnitConfig, ModelErrors, MonitorConfig, PlantConfig,
+    PlantModel, SensorConfig, Terrain, TerrainBox, TerrainGap, WatchdogConfig,
 };
 use delmpc_robots::{Geometry, RobotModel, ShapeRole};
 use delmpc_scenario::{Base, Clock, PushSettings, Scenario};

@@ -49,10 +49,10 @@ const END_PATIENCE_S: f64 = 3.0;
 /// The way to a plant that is steered; empty until it is started.
 pub type PlantPipe = Arc<Mutex<Option<ChildStdin>>>;
 
-/// Who plays the plant.
+/// Who plays a role.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum PlantProgram {
-    /// `delmpc plant`.
+pub enum Program {
+    /// `delmpc plant`, `delmpc controller`.
     Ours,
     /// A command of somebody else's, run by the shell.
     Foreign {
@@ -71,7 +71,9 @@ pub struct Supervision {
     /// Our program.
     pub program: PathBuf,
     /// Who plays the plant.
-    pub plant: PlantProgram,
+    pub plant: Program,
+    /// Who plays the controller.
+    pub controller: Program,
     /// Arguments of each process after its role's name.
     pub arguments: Vec<String>,
     /// Where what the processes say is kept.
@@ -324,13 +326,17 @@ impl Supervision {
         if let Some(pipe) = steering {
             *pipe.lock().unwrap_or_else(PoisonError::into_inner) = child.stdin.take();
         }
-        let foreign = role == Role::Plant && self.plant != PlantProgram::Ours;
+        let foreign = *self.program_of(role) != Program::Ours;
         Ok(Watched { role, child, peer, ended: None, listener, said, used_s: 0.0, foreign, paused: false })
+    }
+
+    fn program_of(&self, role: Role) -> &Program {
+        if role == Role::Plant { &self.plant } else { &self.controller }
     }
 
     /// What to start for a role.
     fn command(&self, role: Role) -> Command {
-        if let (Role::Plant, PlantProgram::Foreign { command, environment }) = (role, &self.plant) {
+        if let Program::Foreign { command, environment } = self.program_of(role) {
             let mut shell = Command::new("/bin/sh");
             shell.args(["-c", command]).envs(environment.iter().map(|(name, value)| (*name, value)));
             // So that whatever it starts ends with it; and so that Ctrl-C is for us to pass on.

@@ -87,7 +87,10 @@ fn codes() -> Vec<(&'static str, Vec<Code>)> {
     };
     macro_rules! all {
         ($source:expr, $type:ty) => {
-            of($source, (0..64).filter_map(|code| Some((format!("{:?}", <$type>::from_code(code)?), code))).collect())
+            of(
+                $source,
+                (0..64).filter_map(|code| Some((format!("{:?}", <$type>::from_code(code)?), code))).collect(),
+            )
         };
     }
     macro_rules! bits {
@@ -116,9 +119,9 @@ fn reasons() -> Vec<Code> {
         include_str!("../shared/messages/src/error.rs"),
         include_str!("../controller/core/src/cycle/reason.rs"),
     );
-    let codes = MessageError::CODES.iter().map(|(name, code)| {
-        ((*name).to_owned(), *code, comment_above(errors, &format!("{name} {{")))
-    });
+    let codes = MessageError::CODES
+        .iter()
+        .map(|(name, code)| ((*name).to_owned(), *code, comment_above(errors, &format!("{name} {{"))));
     macro_rules! own {
         ($($name:ident),+) => {
             [$((stringify!($name).to_owned(), reason::$name, comment_above(own_reasons, concat!("pub const ", stringify!($name), ":")))),+]
@@ -214,7 +217,8 @@ fn messages_table() -> String {
 
 fn services_table() -> String {
     let mut text =
-        "| service `delmpc/RUN/...` | payload | buffer | subscribers | attribute |\n|---|---|---|---|---|\n".to_owned();
+        "| service `delmpc/RUN/...` | payload | buffer | subscribers | attribute |\n|---|---|---|---|---|\n"
+            .to_owned();
     for (channel, payload) in CHANNELS {
         let attribute = if channel.needs_same_joint_set() { "`joint_set_hash`" } else { "" };
         let (name, buffer, places) = (channel.name(), channel.buffer_size(), channel.max_subscribers());

@@ -71,13 +71,19 @@ struct Ends {
 
 impl Bench {
     /// Opens a run of its own and starts the plant.
-    pub fn start(setup: &Setup, folder: &RunFolder, plant: &str, obstacle: Obstacle) -> Result<Self, Failure> {
+    pub fn start(
+        setup: &Setup,
+        folder: &RunFolder,
+        plant: &str,
+        obstacle: Obstacle,
+    ) -> Result<Self, Failure> {
         let run = RunId::random().map_err(Failure::fault)?;
         let connection = Connection::new(setup, run, &folder.file("scenario.toml"))?;
         let file = connection.write(folder.path())?;
         let hash = setup.joint_set_hash();
         let held = watchdog(setup)?;
-        let law = held.law.ok_or_else(|| Failure::Input("the robot cannot be held in its posture".to_owned()))?;
+        let law =
+            held.law.ok_or_else(|| Failure::Input("the robot cannot be held in its posture".to_owned()))?;
         let ends = Ends::open(run, hash, obstacle)?;
         let mut child = std::process::Command::new("/bin/sh")
             .args(["-c", plant])
@@ -93,7 +99,8 @@ impl Bench {
             let said = said.clone();
             std::thread::spawn(move || {
                 for line in BufReader::new(stream).split(b'\n').map_while(Result::ok) {
-                    *said.lock().unwrap_or_else(PoisonError::into_inner) = String::from_utf8_lossy(&line).into_owned();
+                    *said.lock().unwrap_or_else(PoisonError::into_inner) =
+                        String::from_utf8_lossy(&line).into_owned();
                 }
             })
         });
@@ -152,7 +159,8 @@ impl Bench {
                 return Ok(Some(found));
             }
             if self.ended.is_none() {
-                self.ended = self.child.try_wait().map_err(Failure::fault)?.map(|status| status.code().unwrap_or(-1));
+                self.ended =
+                    self.child.try_wait().map_err(Failure::fault)?.map(|status| status.code().unwrap_or(-1));
             }
             if begin.elapsed() > patience || self.ended.is_some() {
                 return Ok(None);
@@ -194,9 +202,8 @@ impl Bench {
     }
 
     pub fn peer_becomes(&mut self, state: ProcessState, patience: Duration) -> Result<bool, Failure> {
-        let became = self.until(patience, |bench| {
-            Ok(bench.peer_state().filter(|is| *is as u32 >= state as u32))
-        })?;
+        let became =
+            self.until(patience, |bench| Ok(bench.peer_state().filter(|is| *is as u32 >= state as u32)))?;
         Ok(became == Some(state) || became.is_some_and(|is| state == ProcessState::Ready && is as u32 > 1))
     }
 
@@ -291,11 +298,17 @@ impl Ends {
             peer: Peer::new(&node, Role::Plant).map_err(Failure::fault)?,
             states: node.subscriber(Channel::State).map_err(Failure::fault)?,
             truths: node.recorder(Channel::Truth).map_err(Failure::fault)?,
-            commands: (!blocks).then(|| node.publisher(Channel::Command)).transpose().map_err(Failure::fault)?,
+            commands: (!blocks)
+                .then(|| node.publisher(Channel::Command))
+                .transpose()
+                .map_err(Failure::fault)?,
             beats: node.subscriber(Channel::Heartbeat(Role::Plant)).map_err(Failure::fault)?,
             beat: 0,
             truths_told: 0,
-            _obstacle: blocks.then(|| node.publisher(Channel::Command)).transpose().map_err(Failure::fault)?,
+            _obstacle: blocks
+                .then(|| node.publisher(Channel::Command))
+                .transpose()
+                .map_err(Failure::fault)?,
         })
     }
 

@@ -93,130 +93,149 @@ macro_rules! layout {
 /// All structures, those that are parts of others first.
 pub fn layouts() -> Vec<Layout> {
     vec![
-        layout!(Header, [
-            (magic, "", ""),
-            (version, "", ""),
-            (joint_set_hash, "", ""),
-            (run_id, "", ""),
-            (sequence, "", ""),
-            (sent_at_ns, "ns", "machine"),
-        ]),
-        layout!(FootReading, [
-            (flags, "", ""),
-            (reserved, "", ""),
-            (torque_s, "N m", "sole"),
-            (force_s, "N", "sole"),
-        ]),
+        layout!(
+            Header,
+            [
+                (magic, "", ""),
+                (version, "", ""),
+                (joint_set_hash, "", ""),
+                (run_id, "", ""),
+                (sequence, "", ""),
+                (sent_at_ns, "ns", "machine"),
+            ]
+        ),
+        layout!(
+            FootReading,
+            [(flags, "", ""), (reserved, "", ""), (torque_s, "N m", "sole"), (force_s, "N", "sole"),]
+        ),
         plant_state(),
         segment(),
         cycle_report(),
-        layout!(StateEstimate, [
-            (known, "", ""),
-            (feet_loaded, "", ""),
-            (base_orientation_w, "1", "world"),
-            (base_angular_velocity_b, "rad/s", "base link"),
-            (base_linear_velocity_b, "m/s", "base link"),
-            (gyro_bias, "rad/s", "inertial unit"),
-            (accelerometer_bias, "m/s²", "inertial unit"),
-        ]),
+        layout!(
+            StateEstimate,
+            [
+                (known, "", ""),
+                (feet_loaded, "", ""),
+                (base_orientation_w, "1", "world"),
+                (base_angular_velocity_b, "rad/s", "base link"),
+                (base_linear_velocity_b, "m/s", "base link"),
+                (gyro_bias, "rad/s", "inertial unit"),
+                (accelerometer_bias, "m/s²", "inertial unit"),
+            ]
+        ),
         command(),
-        layout!(Heartbeat, [
-            (header, "", ""),
-            (time_ns, "ns", "machine"),
-            (role, "", ""),
-            (pid, "", ""),
-            (state, "", ""),
-            (fault_code, "", ""),
-        ]),
+        layout!(
+            Heartbeat,
+            [
+                (header, "", ""),
+                (time_ns, "ns", "machine"),
+                (role, "", ""),
+                (pid, "", ""),
+                (state, "", ""),
+                (fault_code, "", ""),
+            ]
+        ),
     ]
 }
 
 fn plant_state() -> Layout {
-    layout!(PlantState, [
-        (header, "", ""),
-        (time_ns, "ns", "plant"),
-        (applied_command_sequence, "", ""),
-        (clock, "", ""),
-        (n_joints, "", ""),
-        (n_feet, "", ""),
-        (sensors, "", ""),
-        (status_flags, "", ""),
-        (watchdog_level, "", ""),
-        (position, "rad", "joint"),
-        (velocity, "rad/s", "joint"),
-        (applied_torque, "N m", "joint"),
-        (imu_angle, "rad", "inertial unit"),
-        (imu_velocity, "m/s", "inertial unit"),
-        (imu_angular_velocity, "rad/s", "inertial unit"),
-        (imu_specific_force, "m/s²", "inertial unit"),
-        (feet, "", ""),
-        (base_position_w, "m", "world"),
-        (base_orientation_w, "1", "world"),
-        (base_angular_velocity_b, "rad/s", "base link"),
-        (base_linear_velocity_b, "m/s", "base link"),
-    ])
+    layout!(
+        PlantState,
+        [
+            (header, "", ""),
+            (time_ns, "ns", "plant"),
+            (applied_command_sequence, "", ""),
+            (clock, "", ""),
+            (n_joints, "", ""),
+            (n_feet, "", ""),
+            (sensors, "", ""),
+            (status_flags, "", ""),
+            (watchdog_level, "", ""),
+            (position, "rad", "joint"),
+            (velocity, "rad/s", "joint"),
+            (applied_torque, "N m", "joint"),
+            (imu_angle, "rad", "inertial unit"),
+            (imu_velocity, "m/s", "inertial unit"),
+            (imu_angular_velocity, "rad/s", "inertial unit"),
+            (imu_specific_force, "m/s²", "inertial unit"),
+            (feet, "", ""),
+            (base_position_w, "m", "world"),
+            (base_orientation_w, "1", "world"),
+            (base_angular_velocity_b, "rad/s", "base link"),
+            (base_linear_velocity_b, "m/s", "base link"),
+        ]
+    )
 }
 
 fn segment() -> Layout {
-    layout!(Segment, [
-        (begin_ns, "ns", "command"),
-        (torque, "N m", "joint"),
-        (torque_lower, "N m", "joint"),
-        (torque_upper, "N m", "joint"),
-        (position_ref, "rad", "joint"),
-        (velocity_ref, "rad/s", "joint"),
-        (acceleration_ref, "rad/s²", "joint"),
-        (imu_angle_ref, "rad", "inertial unit"),
-        (imu_rate_ref, "rad/s", "inertial unit"),
-        (imu_acceleration_ref, "rad/s²", "inertial unit"),
-    ])
+    layout!(
+        Segment,
+        [
+            (begin_ns, "ns", "command"),
+            (torque, "N m", "joint"),
+            (torque_lower, "N m", "joint"),
+            (torque_upper, "N m", "joint"),
+            (position_ref, "rad", "joint"),
+            (velocity_ref, "rad/s", "joint"),
+            (acceleration_ref, "rad/s²", "joint"),
+            (imu_angle_ref, "rad", "inertial unit"),
+            (imu_rate_ref, "rad/s", "inertial unit"),
+            (imu_acceleration_ref, "rad/s²", "inertial unit"),
+        ]
+    )
 }
 
 fn cycle_report() -> Layout {
-    layout!(CycleReport, [
-        (state_in_ns, "ns", ""),
-        (shift_ns, "ns", ""),
-        (linearize_ns, "ns", ""),
-        (riccati_ns, "ns", ""),
-        (qp_ns, "ns", ""),
-        (publish_ns, "ns", ""),
-        (total_ns, "ns", ""),
-        (worst_violation, "", ""),
-        (worst_constraint, "", ""),
-        (worst_stage, "", ""),
-        (worst_row, "", ""),
-        (qp_solves, "", ""),
-        (qp_iterations, "", ""),
-        (active_rows, "", ""),
-        (dropped_rows, "", ""),
-        (allocations, "", ""),
-    ])
+    layout!(
+        CycleReport,
+        [
+            (state_in_ns, "ns", ""),
+            (shift_ns, "ns", ""),
+            (linearize_ns, "ns", ""),
+            (riccati_ns, "ns", ""),
+            (qp_ns, "ns", ""),
+            (publish_ns, "ns", ""),
+            (total_ns, "ns", ""),
+            (worst_violation, "", ""),
+            (worst_constraint, "", ""),
+            (worst_stage, "", ""),
+            (worst_row, "", ""),
+            (qp_solves, "", ""),
+            (qp_iterations, "", ""),
+            (active_rows, "", ""),
+            (dropped_rows, "", ""),
+            (allocations, "", ""),
+        ]
+    )
 }
 
 fn command() -> Layout {
-    layout!(Command, [
-        (header, "", ""),
-        (state_sequence, "", ""),
-        (state_time_ns, "ns", "plant"),
-        (valid_from_ns, "ns", "plant"),
-        (valid_until_ns, "ns", "plant"),
-        (n_joints, "", ""),
-        (verdict, "", ""),
-        (fallback_level, "", ""),
-        (reason, "", ""),
-        (n_segments, "", ""),
-        (rate_samples, "", ""),
-        (segments, "", ""),
-        (gain, "N m/rad, N m s/rad", "joint"),
-        (imu_gain, "N m/rad, N m s/rad", "inertial unit"),
-        (imu_rate_bias, "rad/s", "inertial unit"),
-        (load_foot, "", ""),
-        (full_load_n, "N", "sole"),
-        (unloaded_stiffness, "N m/rad", "joint"),
-        (unloaded_damping, "N m s/rad", "joint"),
-        (report, "", ""),
-        (estimate, "", ""),
-    ])
+    layout!(
+        Command,
+        [
+            (header, "", ""),
+            (state_sequence, "", ""),
+            (state_time_ns, "ns", "plant"),
+            (valid_from_ns, "ns", "plant"),
+            (valid_until_ns, "ns", "plant"),
+            (n_joints, "", ""),
+            (verdict, "", ""),
+            (fallback_level, "", ""),
+            (reason, "", ""),
+            (n_segments, "", ""),
+            (rate_samples, "", ""),
+            (segments, "", ""),
+            (gain, "N m/rad, N m s/rad", "joint"),
+            (imu_gain, "N m/rad, N m s/rad", "inertial unit"),
+            (imu_rate_bias, "rad/s", "inertial unit"),
+            (load_foot, "", ""),
+            (full_load_n, "N", "sole"),
+            (unloaded_stiffness, "N m/rad", "joint"),
+            (unloaded_damping, "N m s/rad", "joint"),
+            (report, "", ""),
+            (estimate, "", ""),
+        ]
+    )
 }
 
 /// The comment above a field.

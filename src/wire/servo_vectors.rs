@@ -119,7 +119,10 @@ fn vectors() -> Value {
                 40 => command.verdict = Verdict::Late as u32,
                 45 => command.segments[1].begin_ns = 0,
                 50 => command.segments[0].torque_lower[0] = 99.0,
-                55 => (command.valid_from_ns, command.valid_until_ns) = (now_ns + 30_000 * MS, now_ns + 30_001 * MS),
+                55 => {
+                    (command.valid_from_ns, command.valid_until_ns) =
+                        (now_ns + 30_000 * MS, now_ns + 30_001 * MS)
+                }
                 _ => {}
             }
             let taken = servo.accept(&command, now_ns).is_ok();
@@ -132,8 +135,12 @@ fn vectors() -> Value {
         let load_n = 25.0 + 40.0 * number(&mut random);
         let reading =
             FootReading { flags: foot::WRENCH, reserved: 0, torque_s: [0.0; 3], force_s: [0.0, 0.0, load_n] };
-        let readings =
-            ServoReadings { position: &position, velocity: &velocity, imu: Some((angle, rate)), feet: &[reading] };
+        let readings = ServoReadings {
+            position: &position,
+            velocity: &velocity,
+            imu: Some((angle, rate)),
+            feet: &[reading],
+        };
         let mut torque = [0.0; JOINTS];
         servo.torque_into(now_ns, &readings, &mut torque);
         steps.push(json!({
@@ -167,7 +174,8 @@ fn the_committed_vectors_are_those_of_this_servo() {
     if std::env::var_os("DELMPC_WRITE_VECTORS").is_some() {
         std::fs::write(&path, &text).unwrap();
     }
-    let found: Value = serde_json::from_str(&std::fs::read_to_string(&path).unwrap_or_default()).unwrap_or_default();
+    let found: Value =
+        serde_json::from_str(&std::fs::read_to_string(&path).unwrap_or_default()).unwrap_or_default();
     assert_eq!(found["steps"].as_array().map(Vec::len), Some(260), "{FILE} is missing");
     let mut levels = std::collections::BTreeSet::new();
     let ours = vectors();
@@ -177,7 +185,8 @@ fn the_committed_vectors_are_those_of_this_servo() {
             assert_eq!(found[key], ours[key], "{FILE}: {key} at {}", ours["now_ns"]);
         }
         for joint in 0..JOINTS {
-            let (found, ours) = (found["torque"][joint].as_f64().unwrap(), ours["torque"][joint].as_f64().unwrap());
+            let (found, ours) =
+                (found["torque"][joint].as_f64().unwrap(), ours["torque"][joint].as_f64().unwrap());
             assert!((found - ours).abs() <= 1e-12 * ours.abs().max(1.0), "{FILE}: {found} {ours}");
         }
     }

@@ -313,7 +313,10 @@ fn tell_why(refusals: &mut Refusals, controller: &impl Controller, state: &Plant
     refusals.tell(reason, || {
         match state.validate(command.header.joint_set_hash, command.n_joints as usize) {
             Err(error) if error.code() == reason => format!("state {sequence} is refused: {error}"),
-            _ => format!("state {sequence} is refused: {} (reason {reason})", controller.reason_in_words(reason)),
+            _ => format!(
+                "state {sequence} is refused: {} (reason {reason})",
+                controller.reason_in_words(reason)
+            ),
         }
     });
 }

@@ -106,7 +106,9 @@ mod tests {
         let run = RunId(0x12ab);
         assert_eq!(run.to_string(), "00000000000012ab");
         assert_eq!("00000000000012ab".parse::<RunId>().unwrap(), run);
-        for text in ["", "12ab", "+0000000000012ab", "00000000000012ab0", "two words", "../x", "é", &"x".repeat(65)] {
+        for text in
+            ["", "12ab", "+0000000000012ab", "00000000000012ab0", "two words", "../x", "é", &"x".repeat(65)]
+        {
             assert!(matches!(text.parse::<RunId>(), Err(LinkError::InvalidRunId { .. })), "{text:?}");
         }
     }
