@@ -140,6 +140,7 @@ const WIRE_EXAMPLES: &str = "\
 Examples:
   delmpc wire                                   the page, shared/messages/WIRE.md
   delmpc wire --json > wire.json                every payload: field, offset, size, type, unit, frame
+  delmpc wire --c > delmpc.h                    for C and C++
   delmpc wire --connection configs/scenarios/atlas_one_foot.toml --run-id bench-3";
 
 const PLANT_CHECK_EXAMPLES: &str = "\

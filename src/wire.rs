@@ -2,6 +2,7 @@
 //!
 //! Layouts come from the types ([`layout`]); the prose around the tables is in `src/wire/page.md`.
 
+pub mod c_header;
 pub mod layout;
 #[cfg(test)]
 mod servo_vectors;
@@ -25,6 +26,7 @@ use crate::output::print;
 use crate::part::run_id_of;
 use crate::setup::Setup;
 use crate::verdict::{Ended, Failure};
+use c_header::c_header;
 use layout::{Layout, comment_above, layouts};
 
 /// Arguments of `delmpc wire`.
@@ -33,8 +35,11 @@ pub struct WireArguments {
     /// Every payload with field, offset, size, type, unit and frame, as JSON instead of the page
     #[arg(long)]
     pub json: bool,
+    /// A header for C and C++ instead of the page
+    #[arg(long, conflicts_with = "json")]
+    pub c: bool,
     /// The description of a run of this scenario instead: connection.json, as `delmpc run --plant` gives it to the plant
-    #[arg(long, value_name = "SCENARIO", conflicts_with = "json")]
+    #[arg(long, value_name = "SCENARIO", conflicts_with_all = ["json", "c"])]
     pub connection: Option<PathBuf>,
     /// Override a key of that scenario
     #[arg(long, value_name = "KEY=VALUE", requires = "connection")]
@@ -55,7 +60,11 @@ pub fn wire(arguments: &WireArguments) -> Result<Ended, Failure> {
         let connection = Connection::new(&setup, run, file)?;
         print(&pretty(connection.description()))?;
     } else {
-        print(&if arguments.json { description_text() } else { page() })?;
+        print(&match (arguments.json, arguments.c) {
+            (true, _) => description_text(),
+            (_, true) => c_header(),
+            _ => page(),
+        })?;
     }
     Ok(Ended::Well)
 }
@@ -276,6 +285,7 @@ mod tests {
             ("shared/messages/WIRE.md", page(), "delmpc wire"),
             ("shared/messages/wire.json", description_text(), "delmpc wire --json"),
             ("python/delmpc/wire.json", description_text(), "delmpc wire --json"),
+            ("shared/messages/delmpc.h", c_header(), "delmpc wire --c"),
         ] {
             let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(file);
             let found = std::fs::read_to_string(&path).unwrap_or_default();

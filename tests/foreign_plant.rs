@@ -168,6 +168,30 @@ fn a_run_that_somebody_named_is_found_by_that_name() {
 }
 
 #[test]
+fn the_header_for_c_is_one() {
+    for (compiler, standard) in [("cc", "-std=c11"), ("c++", "-std=c++11")] {
+        let language = if compiler == "cc" { "c" } else { "c++" };
+        let checked = Command::new(compiler)
+            .args([
+                "-x",
+                language,
+                standard,
+                "-Wall",
+                "-Wextra",
+                "-Werror",
+                "-fsyntax-only",
+                "shared/messages/delmpc.h",
+            ])
+            .current_dir(ROOT)
+            .output();
+        match checked {
+            Ok(output) => assert!(output.status.success(), "{compiler}: {}", words(&output)),
+            Err(error) => println!("skipped: {compiler}: {error}"),
+        }
+    }
+}
+
+#[test]
 fn the_python_package_has_the_servo_of_rust() {
     if python_has("numpy") {
         let output =

@@ -12,6 +12,7 @@ from .wire import CODES, HEARTBEAT, MESSAGES, TYPES, WIRE, message
 _PAYLOADS = {item["payload"]: item["name"] for item in WIRE["messages"]}
 ROLES, STATES = CODES["role"], CODES["state"]
 _PATIENCE_S = 20.0
+_FAULT_REFUSED = 1
 
 
 class Connection:
@@ -170,6 +171,11 @@ class Member:
             self._beat[0]["state"] = STATES[state]
             self._send()
 
+    def refuse(self):
+        """Says that we do not fit to the others, and go."""
+        self._beat[0]["fault_code"] = _FAULT_REFUSED
+        self.announce("Fault")
+
     def _send(self):
         beat = self._beat[0]
         beat["header"]["sequence"] += 1
@@ -194,6 +200,10 @@ class Member:
             if name == self.other and int(beat["header"]["joint_set_hash"]) != self.connection.joint_set_hash:
                 self.say_once(f"the {name} of this run has other joints (hash {int(beat['header']['joint_set_hash']):016x}, ours is "
                               f"{self.connection.joint_set_hash:016x}): it is refused")
+                continue
+            if int(beat["state"]) == STATES["Fault"] and int(beat["fault_code"]) == _FAULT_REFUSED:
+                self.say_once(f"a {name} process could not connect: its messages are of another version, or its services have other settings")
+                self.heard[name] = None
                 continue
             self.heard[name] = beat
         if self.stopped:

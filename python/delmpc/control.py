@@ -27,8 +27,12 @@ class _Control:
         self.controller, self.connection, self.life_ns = controller, connection, round(life_s * 1e9)
         self.node = Node(connection)
         self.member = Member(self.node, "controller")
-        self.commands = self.node.publisher("command")
-        self.states = self.node.subscriber("state")
+        try:
+            self.commands = self.node.publisher("command")
+            self.states = self.node.subscriber("state")
+        except ConnectionError:
+            self.member.refuse()
+            raise
         self.period_ns = connection["time"]["cycle_ns"]
         self.sequence, self.state = 0, None
 

@@ -38,9 +38,13 @@ class _Loop:
         self.node = Node(connection)
         self.member = Member(self.node, "plant")
         # The ear before the mouth: the answer to the first state must not be missed.
-        self.commands = self.node.subscriber("command")
-        self.states = self.node.publisher("state")
-        self.truths = self.node.publisher("truth") if hasattr(plant, "fill_truth") else None
+        try:
+            self.commands = self.node.subscriber("command")
+            self.states = self.node.publisher("state")
+            self.truths = self.node.publisher("truth") if hasattr(plant, "fill_truth") else None
+        except ConnectionError:
+            self.member.refuse()
+            raise
         self.queue, self.refused = CommandQueue(connection), 0
         self.state = self._blank()
         self.truth = self._blank()

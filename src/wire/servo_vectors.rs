@@ -107,7 +107,7 @@ fn vectors() -> Value {
     for ms in 0..260_u64 {
         let now_ns = ms * MS;
         let mut sent = None;
-        let speaks = ms < 60 || ms >= 210;
+        let speaks = !(60..210).contains(&ms);
         if speaks && ms % 5 == 0 && ms > 0 {
             sequence += 1;
             let mut command = command(&mut random, sequence, now_ns);
