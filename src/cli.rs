@@ -10,11 +10,13 @@ use crate::init::InitArguments;
 use crate::keys::KeysArguments;
 use crate::model::ModelArguments;
 use crate::plan::PlanArguments;
+use crate::plant_check::PlantCheckArguments;
 use crate::push_map::PushMapArguments;
 use crate::replay::ReplayArguments;
 use crate::report::ReportArguments;
 use crate::timing::TimingArguments;
 use crate::timing::transport::TransportPeerArguments;
+use crate::wire::WireArguments;
 
 /// What `--help` shows at its end.
 const EXAMPLES: &str = "\
@@ -53,6 +55,7 @@ Examples:
   delmpc run --view --set duration_s=60               watch, push with the mouse, pause
   delmpc run --set clock=lockstep                     the same bits every time, as fast as it goes
   delmpc run --json | jq .min_cop_margin_m            one figure
+  delmpc run --plant 'python3 examples/mujoco/plant.py' --set clock=lockstep
   delmpc run runs/latest/scenario.toml                a run of yesterday again
 
 The folder of a run:
@@ -133,6 +136,19 @@ Examples:
   delmpc keys --companion
   delmpc keys --schema > scenario.schema.json   for an editor that knows JSON schemas of TOML files";
 
+const WIRE_EXAMPLES: &str = "\
+Examples:
+  delmpc wire                                   the page, shared/messages/WIRE.md
+  delmpc wire --json > wire.json                every payload: field, offset, size, type, unit, frame
+  delmpc wire --c > delmpc.h                    for C and C++
+  delmpc wire --connection configs/scenarios/atlas_one_foot.toml --run-id bench-3";
+
+const PLANT_CHECK_EXAMPLES: &str = "\
+Examples:
+  delmpc plant-check 'python3 examples/mujoco/plant.py'
+  delmpc plant-check './my_plant' my_robot/stand.toml --json
+  delmpc plant-check 'exec delmpc plant $DELMPC_SCENARIO --run-id $DELMPC_RUN_ID --supervised'   our own";
+
 const CHECK_EXAMPLES: &str = "\
 Examples:
   delmpc check configs/scenarios/*.toml
@@ -211,6 +227,17 @@ pub enum Command {
     /// List every key of scenarios and companion tables: what it takes, its default, what it means; or a JSON schema for editors
     #[command(after_long_help = KEYS_EXAMPLES)]
     Keys(KeysArguments),
+    /// Tell what plant and controller say to each other: a page, JSON for other languages, or the description of a run
+    ///
+    /// For whoever writes another plant or another controller: services, layouts, codes, duties, and what is refused.
+    #[command(after_long_help = WIRE_EXAMPLES)]
+    Wire(WireArguments),
+    /// Put a plant of your own through its duties: start, answers, bounds, bad commands, silence, watchdog, end
+    ///
+    /// The plant is started as by `delmpc run --plant`, in lockstep, and asked what shared/messages/WIRE.md demands. Exit status 1 when a
+    /// duty is not met.
+    #[command(after_long_help = PLANT_CHECK_EXAMPLES)]
+    PlantCheck(PlantCheckArguments),
     /// Find the largest push survived in every direction: table, JSON, polar plot
     ///
     /// The robot stands in the scenario's posture and is pushed once, in lockstep; the impulse is found by bisection. Left behind are
@@ -278,6 +305,15 @@ pub struct RunOptions {
     /// Both parts in one process: deterministic, for debugging; needs the lockstep clock
     #[arg(long)]
     pub one_process: bool,
+    /// The plant is this command, run by /bin/sh, instead of our simulation: another simulator, a robot
+    ///
+    /// It finds its run by DELMPC_CONNECTION, a JSON file, and talks the messages of shared/messages/WIRE.md. Log, report and verdict
+    /// are as usual.
+    #[arg(long, value_name = "COMMAND", conflicts_with_all = ["one_process", "view"])]
+    pub plant: Option<String>,
+    /// The controller is this command instead of ours, started in the same way
+    #[arg(long, value_name = "COMMAND", conflicts_with = "one_process")]
+    pub controller: Option<String>,
 }
 
 /// Arguments of `delmpc run`.
@@ -313,7 +349,7 @@ pub struct PartArguments {
     /// Override a key of the scenario; give both processes the same
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
-    /// Run that the process belongs to, 16 hexadecimal digits [default: made from the scenario, the same for both]
+    /// Run that the process belongs to: 16 hexadecimal digits, or a name [default: made from the scenario, the same for both]
     #[arg(long, value_name = "ID")]
     pub run_id: Option<String>,
     /// Folder of the run, the same for both: new, empty or of an earlier run. The one that ends last writes summary and report

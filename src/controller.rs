@@ -86,8 +86,10 @@ impl ControllerProcess<'_> {
         if !arguments.supervised {
             say(&format!("run {run}: the controller waits for a plant of the same scenario"));
         }
-        let commands = membership.node().publisher(Channel::Command).map_err(Failure::fault)?;
-        let states = membership.node().subscriber(Channel::State).map_err(Failure::fault)?;
+        let commands = membership.node().publisher(Channel::Command);
+        let commands = membership.connected(commands).map_err(Failure::fault)?;
+        let states = membership.node().subscriber(Channel::State);
+        let states = membership.connected(states).map_err(Failure::fault)?;
         let blank = Command::new(message_run_id(run, scenario), hash, setup.robot.joint_names.len() as u32);
         let mut controller_loop = ControllerLoop::new(scenario, states, commands, &blank);
         if scenario.clock == Clock::Realtime {

@@ -119,6 +119,10 @@ impl<C: Controller> Controller for FaultyController<C> {
     fn prepare(&mut self) {
         self.controller.prepare();
     }
+
+    fn reason_in_words(&self, reason: u32) -> &'static str {
+        self.controller.reason_in_words(reason)
+    }
 }
 
 /// A plant that gets the commands of a bad link.

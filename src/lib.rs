@@ -29,9 +29,15 @@
 //! | [`drawing`] | a robot in its postures as SVG |
 //! | [`mod@keys`] | every key of a scenario, from the types that read it |
 //! | [`completions`] | what a shell needs to complete our words |
+//! | [`log_ros`] | transforms and joint states as ROS 2 has them |
 //! | [`log`], [`log_viewer`] | the log of states, commands and truth, and what shows the robot to viewers of logs |
 //! | [`log_queue`], [`log_file`], [`log_command`], [`log_reader`] | its way to the file, the file, commands in it, and its way back |
 //! | [`mod@report`] | the run to look at: `report.html` and pictures of the key plots |
+//! | [`connection`] | what a process that is not ours needs to know of a run |
+//! | [`foreign_plant`], [`foreign_truth`] | a plant of somebody else's: log, figures and verdict of what it tells |
+//! | [`foreign_controller`] | a controller of somebody else's: its commands counted |
+//! | [`wire`] | the messages as a page and as JSON, from the types |
+//! | [`mod@plant_check`] | the duties of a plant of somebody else's, one by one |
 //! | [`steering`] | what a person does to a running plant |
 //! | [`view`] | the live page: watch, pull, pause |
 //! | [`tape`] | everything that enters the cycles of a run, kept, and given again |
@@ -45,9 +51,13 @@ pub mod check;
 pub mod cli;
 pub mod colour;
 pub mod completions;
+pub mod connection;
 pub mod controller;
 pub mod drawing;
 pub mod faults;
+pub mod foreign_controller;
+pub mod foreign_plant;
+pub mod foreign_truth;
 pub mod init;
 pub mod input_file;
 pub mod keys;
@@ -58,6 +68,7 @@ pub mod log_command;
 pub mod log_file;
 pub mod log_queue;
 pub mod log_reader;
+pub mod log_ros;
 mod log_schema;
 pub mod log_viewer;
 pub mod mesh_file;
@@ -75,6 +86,7 @@ pub mod plan_source;
 pub mod plan_task;
 pub mod planned_walk;
 pub mod plant;
+pub mod plant_check;
 pub mod plant_process;
 pub mod push_map;
 pub mod replay;
@@ -98,3 +110,4 @@ pub mod timing;
 pub mod truth;
 pub mod verdict;
 pub mod view;
+pub mod wire;

@@ -4,7 +4,7 @@
 //! two forms are the same, bit for bit; commands are packed to what they use ([`crate::log_command`]). The schemas in this file say what the
 //! bytes are, and any MCAP tool reads them.
 //!
-//! Beside them, in JSON, what makes viewers show the robot: [`crate::log_viewer`]. Scenario and robot are attached as files.
+//! Beside them what makes viewers show the robot, in ROS 2's own types and in JSON: [`crate::log_viewer`]. Scenario and robot are attached as files.
 //!
 //! The loop only copies records into a ring of memory that is there before the run ([`crate::log_queue`]). A thread of its own writes
 //! them ([`crate::log_file`]), so that a killed process loses what is younger than 50 ms: in real time it goes before ordinary programs,
@@ -23,6 +23,7 @@ use delmpc_messages::{Command, PlantState};
 use crate::log_command;
 use crate::log_file::LogFile;
 use crate::log_queue::{Head, Receiver, Sender, queue};
+use crate::log_ros::{self, ENCAPSULATION};
 use crate::log_schema::{PULL_FIELDS, TRUTH_FIELDS, command_schema, plant_state_schema};
 use crate::log_viewer::{self, LogViewer};
 use crate::steering::Pull;
@@ -33,8 +34,6 @@ use crate::verdict::Failure;
 const REALTIME_RING: usize = 64 << 20;
 /// ... and enough to keep the writer busy where the loop waits.
 const LOCKSTEP_RING: usize = 2 << 20;
-/// Little-endian CDR, no options.
-const ENCAPSULATION: [u8; 4] = [0, 1, 0, 0];
 
 /// Channels of the log.
 pub const STATE: &str = "/plant/state";
@@ -191,13 +190,18 @@ fn begin(path: &Path, head: &LogHead) -> io::Result<(LogFile, Channels)> {
     }
     let mut viewer = BTreeMap::new();
     if head.viewer.is_some() {
-        let (transforms, scene) = (log_viewer::transforms_schema(), log_viewer::scene_schema());
-        for (topic, schema) in
-            [(log_viewer::TRANSFORMS, &transforms), (log_viewer::ROBOT, &scene), (log_viewer::FORCES, &scene)]
-        {
-            let name = schema["title"].as_str().unwrap_or_default();
-            let schema = file.schema(name, "jsonschema", &schema.to_string())?;
+        let scene = log_viewer::scene_schema();
+        for topic in [log_viewer::ROBOT, log_viewer::FORCES] {
+            let name = scene["title"].as_str().unwrap_or_default();
+            let schema = file.schema(name, "jsonschema", &scene.to_string())?;
             viewer.insert(topic, file.channel(schema, topic, "json")?);
+        }
+        for (topic, name, definition) in [
+            (log_viewer::TRANSFORMS, log_ros::TF_NAME, log_ros::TF_SCHEMA),
+            (log_viewer::JOINTS, log_ros::JOINT_STATE_NAME, log_ros::JOINT_STATE_SCHEMA),
+        ] {
+            let schema = file.schema(name, "ros2msg", definition)?;
+            viewer.insert(topic, file.channel(schema, topic, "cdr")?);
         }
     }
     let mut records = [0; KINDS];
@@ -231,7 +235,7 @@ fn write_all(
             for (topic, message) in viewer.messages(&truth) {
                 if let Some(&channel) = channels.viewer.get(topic) {
                     let number = shown.entry(channel).or_default();
-                    file.message(channel, *number, time_ns, &[message.to_string().as_bytes()])?;
+                    file.message(channel, *number, time_ns, &[&message])?;
                     *number += 1;
                 }
             }

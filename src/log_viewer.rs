@@ -1,12 +1,13 @@
-//! The robot for viewers of logs: transforms of all links, the shapes on them, forces and ball, as JSON messages that describe themselves.
+//! The robot for viewers of logs: transforms of all links and joints as ROS 2 has them, shapes, forces and ball as JSON that describes itself.
 //!
 //! | channel | schema | when |
 //! |---|---|---|
-//! | `/tf` | `foxglove.FrameTransforms`: every link in its parent | 30 Hz |
+//! | `/tf` | `tf2_msgs/TFMessage`: every link in its parent | 30 Hz |
+//! | `/joint_states` | `sensor_msgs/JointState`: positions, velocities, torques by name | 30 Hz |
 //! | `/robot` | `foxglove.SceneUpdate`: the shapes, each fixed to its link; the ball | once |
 //! | `/forces` | `foxglove.SceneUpdate`: ground reaction and push as arrows | 30 Hz |
 //!
-//! Only the structure of the messages is the field's; the schemas are written here. Everything is computed from the truth by the log's
+//! Of the scenes only the structure is the field's; their schemas are written here. Everything is computed from the truth by the log's
 //! writer, never by the loop.
 
 use delmpc_mechanics::prelude::{KinematicTree, RigidTransform};
@@ -14,6 +15,7 @@ use delmpc_robots::{Attachment, Geometry};
 use nalgebra::{Quaternion, Rotation3, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
 
+use crate::log_ros;
 use crate::report::scene::shapes;
 use crate::setup::Setup;
 use crate::sole::pressure_point;
@@ -28,19 +30,22 @@ const BALL_RADIUS_M: f64 = 0.035;
 
 /// Channel of the links.
 pub const TRANSFORMS: &str = "/tf";
+/// Channel of the joints.
+pub const JOINTS: &str = "/joint_states";
 /// Channel of the shapes.
 pub const ROBOT: &str = "/robot";
 /// Channel of the forces.
 pub const FORCES: &str = "/forces";
 
 /// Messages of one moment: channel and content.
-pub type Messages = Vec<(&'static str, Value)>;
+pub type Messages = Vec<(&'static str, Vec<u8>)>;
 
 /// Makes the messages of a run.
 #[derive(Debug, Clone)]
 pub struct LogViewer {
     tree: KinematicTree,
     names: Vec<String>,
+    joint_names: Vec<String>,
     robot: Value,
     sole: Option<Attachment>,
     weight_n: f64,
@@ -56,6 +61,7 @@ impl LogViewer {
         Self {
             tree: robot.tree.clone(),
             names: robot.body_names.clone(),
+            joint_names: robot.joint_names.clone(),
             robot: robot_scene(setup),
             sole: sole.copied(),
             weight_n: robot.tree.total_mass() * robot.tree.gravity_w().norm(),
@@ -76,20 +82,16 @@ impl LogViewer {
         let mut messages = Messages::new();
         if !self.begun {
             self.begun = true;
-            messages.push((ROBOT, self.robot.clone()));
+            messages.push((ROBOT, self.robot.to_string().into_bytes()));
         }
         let links = self.links(truth, position);
-        let transforms = links.iter().zip(&self.names).map(|((parent, pose), name)| {
-            json!({
-                "timestamp": stamp(truth.time_ns),
-                "parent_frame_id": parent.map_or("world", |parent| &self.names[parent]),
-                "child_frame_id": name,
-                "translation": vector(&pose.translation),
-                "rotation": quaternion(pose),
-            })
+        let poses = links.iter().zip(&self.names).map(|((parent, pose), name)| {
+            (parent.map_or("world", |parent| self.names[parent].as_str()), name.as_str(), *pose)
         });
-        messages.push((TRANSFORMS, json!({"transforms": transforms.collect::<Vec<_>>()})));
-        messages.push((FORCES, self.forces(truth, &links)));
+        messages.push((TRANSFORMS, log_ros::transforms(truth.time_ns, poses)));
+        let values = [&truth.position, &truth.velocity, &truth.torque].map(|list| &list[..joints]);
+        messages.push((JOINTS, log_ros::joint_state(truth.time_ns, &self.joint_names, values)));
+        messages.push((FORCES, self.forces(truth, &links).to_string().into_bytes()));
         messages
     }
 
@@ -226,18 +228,6 @@ fn rounded(x: f64) -> f64 {
 
 const PRIMITIVES: [&str; 8] =
     ["arrows", "cubes", "spheres", "cylinders", "lines", "triangles", "texts", "models"];
-
-/// JSON schema of [`TRANSFORMS`].
-pub fn transforms_schema() -> Value {
-    let transform = object(&[
-        ("timestamp", time_schema()),
-        ("parent_frame_id", json!({"type": "string"})),
-        ("child_frame_id", json!({"type": "string"})),
-        ("translation", numbers(&["x", "y", "z"])),
-        ("rotation", numbers(&["x", "y", "z", "w"])),
-    ]);
-    titled("foxglove.FrameTransforms", object(&[("transforms", array(transform))]))
-}
 
 /// JSON schema of [`ROBOT`] and [`FORCES`]. Primitives that are never sent are described as arrays of objects.
 pub fn scene_schema() -> Value {

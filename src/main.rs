@@ -27,6 +27,8 @@ fn main() -> ExitCode {
         Command::Controller(arguments) => delmpc::controller::controller(&arguments, allocations),
         Command::Check(arguments) => delmpc::check::check(&arguments),
         Command::Keys(arguments) => delmpc::keys::keys(&arguments),
+        Command::PlantCheck(arguments) => delmpc::plant_check::plant_check(&arguments),
+        Command::Wire(arguments) => delmpc::wire::wire(&arguments),
         Command::Init(arguments) => delmpc::init::init(&arguments),
         Command::Model(arguments) => delmpc::model::model(&arguments),
         Command::PushMap(arguments) => delmpc::push_map::push_map(&arguments),

@@ -9,7 +9,9 @@ use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 use crate::legged_metrics::{LeggedFigures, LeggedMetrics};
+use crate::setup::Setup;
 use crate::truth::Truth;
+use crate::verdict::Failure;
 
 /// At rest: the mass centre is horizontally this close to where it was when the last push began (m) ...
 const REST_DISTANCE_M: f64 = 0.01;
@@ -168,6 +170,16 @@ impl Metrics {
             estimates: EstimateErrors::default(),
             legged: None,
         }
+    }
+
+    /// For a scenario with its robot: ball, pushes and footholds in the frame of the stance, the feet by their names.
+    ///
+    /// # Errors
+    /// As [`Setup::start`].
+    pub fn judged_for(setup: &Setup) -> Result<Self, Failure> {
+        let sole = |name: &str| setup.robot.soles.iter().position(|sole| sole.name == name);
+        let legged = setup.is_legged().then(|| LeggedMetrics::new(&setup.scenario, sole));
+        Ok(Self::new(&setup.scenario).of_feet(legged).in_stance_frame(&setup.start()?.stance_frame_w))
     }
 
     /// Of a robot on several feet, or on its way.

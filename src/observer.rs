@@ -98,6 +98,16 @@ impl Observer {
         }
     }
 
+    /// Whether the robot is free to move.
+    pub fn floats(&self) -> bool {
+        self.tree.is_floating()
+    }
+
+    /// Where a sole was in the world when the robot was observed last; `None` for a number that no sole has.
+    pub fn sole_pose_w(&self, index: usize) -> Option<RigidTransform> {
+        self.soles.get(index).map(|sole| self.pose_w(sole))
+    }
+
     fn pose_w(&self, frame: &Attachment) -> RigidTransform {
         match frame.body {
             Some(body) => self.kinematics.link_poses_w()[body] * frame.pose,

@@ -32,7 +32,15 @@ use crate::{input_file, output_file};
 /// # Errors
 /// When the name is none of a run.
 pub fn run_id(arguments: &PartArguments, setup: &Setup) -> Result<RunId, Failure> {
-    match &arguments.run_id {
+    run_id_of(arguments.run_id.as_deref(), setup)
+}
+
+/// The run of a name, or the one made from a scenario.
+///
+/// # Errors
+/// As [`run_id`].
+pub fn run_id_of(named: Option<&str>, setup: &Setup) -> Result<RunId, Failure> {
+    match named {
         Some(text) => text.parse().map_err(|error| Failure::Input(format!("--run-id: {error}"))),
         None => RunId::of_text(&setup.scenario.to_toml()).map_err(Failure::fault),
     }

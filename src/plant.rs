@@ -55,8 +55,10 @@ pub fn plant(arguments: &PartArguments) -> Result<Ended, Failure> {
         say(&format!("run {run}: the plant waits for a controller of the same scenario"));
     }
     // First the ear, then the mouth: the answer to the first state must not be missed.
-    let commands = membership.node().subscriber(Channel::Command).map_err(Failure::fault)?;
-    let states = membership.node().publisher(Channel::State).map_err(Failure::fault)?;
+    let commands = membership.node().subscriber(Channel::Command);
+    let commands = membership.connected(commands).map_err(Failure::fault)?;
+    let states = membership.node().publisher(Channel::State);
+    let states = membership.connected(states).map_err(Failure::fault)?;
     let blank = PlantState::new(message_run_id(run, scenario), hash, setup.robot.joint_names.len() as u32);
     let steering = match arguments.steered {
         true => Steering::by_lines(BufReader::new(std::io::stdin()), setup.robot.tree.body_count()),

@@ -26,7 +26,6 @@ use delmpc_messages::{Command, PlantState, ProcessState, status};
 use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::{LinkError, Publisher, Subscriber};
 
-use crate::legged_metrics::LeggedMetrics;
 use crate::log::Log;
 use crate::metrics::Metrics;
 use crate::setup::Setup;
@@ -89,6 +88,11 @@ impl CommandQueue {
             waiting: VecDeque::with_capacity(controller.delay_cycles as usize + 4),
             longest_lead_ns: (lead_s * 1e9).round() as u64,
         }
+    }
+
+    /// A command that begins later than this after it came is refused, ns.
+    pub fn longest_lead_ns(&self) -> u64 {
+        self.longest_lead_ns
     }
 
     /// Takes a command in that came at `now_ns`; a full queue gives up its oldest one. `false`: it is of another run, or lies too far
@@ -216,9 +220,7 @@ impl<'a, P: Publisher<PlantState>, S: Subscriber<Command>> PlantLoop<'a, P, S> {
     /// # Errors
     /// As [`Setup::start`].
     pub fn judged_for(mut self, setup: &Setup) -> Result<Self, Failure> {
-        let sole = |name: &str| setup.robot.soles.iter().position(|sole| sole.name == name);
-        let legged = setup.is_legged().then(|| LeggedMetrics::new(&setup.scenario, sole));
-        self.metrics = self.metrics.of_feet(legged).in_stance_frame(&setup.start()?.stance_frame_w);
+        self.metrics = Metrics::judged_for(setup)?;
         Ok(self)
     }
 

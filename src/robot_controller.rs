@@ -144,6 +144,10 @@ impl<K: CycleClock> Controller for RobotController<K> {
             controller.prepare(&self.clock);
         }
     }
+
+    fn reason_in_words(&self, reason: u32) -> &'static str {
+        delmpc_controller_core::cycle::reason::words(reason)
+    }
 }
 
 /// The reach goes the way of a plan.

@@ -2,13 +2,17 @@
 
 use std::io::{IsTerminal, Write};
 use std::path::Path;
+use std::sync::PoisonError;
 
 use delmpc_controller_process::stop::StopFlag;
-use delmpc_scenario::Clock;
-use delmpc_transport::remove_dead_runs;
+use delmpc_scenario::{Clock, FaultTarget};
+use delmpc_transport::{RunId, remove_dead_runs};
 
 use crate::cli::{RunArguments, RunOptions};
 use crate::colour::Colour;
+use crate::connection::Connection;
+use crate::foreign_controller::CommandCounter;
+use crate::foreign_plant::Listener;
 use crate::one_process::run_in_one_process;
 use crate::output::{line, print, say};
 use crate::part::summarize;
@@ -19,7 +23,7 @@ use crate::setup::{Setup, scenario_file};
 use crate::simulated_robot::SimulatedRobot;
 use crate::status_line::StatusLine;
 use crate::summary_table::summary_table;
-use crate::supervisor::{Course, Supervision, TIDY_UP, fresh_run};
+use crate::supervisor::{Course, Program, Supervision, TIDY_UP, fresh_run};
 use crate::verdict::{Ended, Failure};
 use crate::view::View;
 
@@ -46,8 +50,13 @@ pub fn run(arguments: &RunArguments) -> Result<Ended, Failure> {
     }
     if !options.one_process {
         // What either process would refuse is refused here, before anything is overwritten or started.
-        RobotController::new(&setup)?;
-        SimulatedRobot::new(&setup)?;
+        if options.controller.is_none() {
+            RobotController::new(&setup)?;
+        }
+        match &options.plant {
+            None => drop(SimulatedRobot::new(&setup)?),
+            Some(_) => warn_of_what_is_the_plants(&setup),
+        }
     }
     let folder = RunFolder::create(options.out.as_deref(), &scenario.name)?;
     folder.write_inputs(&setup)?;
@@ -115,9 +124,14 @@ fn run_in_two_processes(
         let _ = writeln!(std::io::stderr(), "open {} to begin", opened.address());
     }
     let scenario = folder.file("scenario.toml");
+    let programs = Programs::of(setup, run, options, folder)?;
+    let mut ears = (programs.listener, programs.counter);
+    let heard = ears.0.as_ref().map(Listener::outcome);
     let supervision = Supervision {
         run,
         program: std::env::current_exe().map_err(Failure::fault)?,
+        plant: programs.plant,
+        controller: programs.controller,
         arguments: vec![text(&scenario)?, "--out".to_owned(), text(folder.path())?],
         messages: folder.file("messages.txt"),
         steering: view.as_ref().map(View::pipe),
@@ -132,6 +146,7 @@ fn run_in_two_processes(
     let mut watch = view.as_ref().map(|view| view.watch(setup, run)).transpose()?;
     // What listens to the run goes into the closure, and ends with it: before the run is tidied up.
     let course = supervision.supervise(stop, move |_| {
+        let _listen = &mut ears;
         if let Some(watch) = &mut watch {
             watch.look();
         }
@@ -143,7 +158,48 @@ fn run_in_two_processes(
     if show {
         let _ = write!(std::io::stderr(), "\r\x1b[K");
     }
-    course
+    match heard.map(|heard| heard.lock().unwrap_or_else(PoisonError::into_inner).clone()) {
+        Some(Err(why)) if course == Ok(Course::Finished) => Err(Failure::Fault(why)),
+        _ => course,
+    }
+}
+
+/// Who plays plant and controller; and who listens to those that are not ours.
+struct Programs {
+    plant: Program,
+    controller: Program,
+    listener: Option<Listener>,
+    counter: Option<CommandCounter>,
+}
+
+impl Programs {
+    fn of(setup: &Setup, run: RunId, options: &RunOptions, folder: &RunFolder) -> Result<Self, Failure> {
+        let ours = Self { plant: Program::Ours, controller: Program::Ours, listener: None, counter: None };
+        if options.plant.is_none() && options.controller.is_none() {
+            return Ok(ours);
+        }
+        let connection = Connection::new(setup, run, &folder.file("scenario.toml"))?;
+        let environment = connection.environment(&connection.write(folder.path())?);
+        let program = |command: &Option<String>| match command {
+            Some(command) => Program::Foreign { command: command.clone(), environment: environment.clone() },
+            None => Program::Ours,
+        };
+        let listen = |command: &String| Listener::begin(setup, run, command, folder.path());
+        let counts = options.controller.is_some();
+        Ok(Self {
+            plant: program(&options.plant),
+            controller: program(&options.controller),
+            listener: options.plant.as_ref().map(listen).transpose()?,
+            counter: counts.then(|| CommandCounter::begin(setup, run, folder.path())).transpose()?,
+        })
+    }
+}
+
+/// Keys of the scenario that our plant would have acted on.
+fn warn_of_what_is_the_plants(setup: &Setup) {
+    if setup.scenario.fault.iter().any(|fault| fault.target == FaultTarget::Command) {
+        say("warning: faults of commands strike within our plant: with --plant they are left out");
+    }
 }
 
 fn text(path: &Path) -> Result<String, Failure> {

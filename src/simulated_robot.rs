@@ -1,5 +1,6 @@
 //! The plant of a scenario: the robot with its feet, actuators, sensors and disturbances, standing in its posture.
 
+use delmpc_controller_process::refusals::Refusals;
 use delmpc_mechanics::inverse_dynamics::{InverseDynamicsWorkspace, gravity_force_into};
 use delmpc_mechanics::kinematics::{Configuration, Kinematics};
 use delmpc_mechanics::mass_matrix::{MassMatrixWorkspace, mass_matrix_into};
@@ -7,9 +8,9 @@ use delmpc_mechanics::prelude::{KinematicTree, RigidTransform, State};
 use delmpc_messages::{ClockKind, Command, PlantState};
 use delmpc_plant::prelude as simulation;
 use delmpc_plant::prelude::{
-    ActuatorConfig, ActuatorLimits, AffineLaw, ContactOptions, ContactPoint, FallCause, Foot, FootReport,
-    GroundGive, HoldingGains, InertialUnitConfig, ModelErrors, MonitorConfig, PlantConfig, PlantModel,
-    SensorConfig, Terrain, TerrainBox, TerrainGap, WatchdogConfig,
+    ActuatorConfig, ActuatorLimits, AffineLaw, CommandRefused, ContactOptions, ContactPoint, FallCause, Foot,
+    FootReport, GroundGive, HoldingGains, InertialUnitConfig, ModelErrors, MonitorConfig, PlantConfig,
+    PlantModel, SensorConfig, Terrain, TerrainBox, TerrainGap, WatchdogConfig,
 };
 use delmpc_robots::{Geometry, RobotModel, ShapeRole};
 use delmpc_scenario::{Base, Clock, PushSettings, Scenario};
@@ -35,6 +36,7 @@ pub struct SimulatedRobot {
     body_names: Vec<String>,
     /// On several feet, or on its way.
     is_legged: bool,
+    refusals: Refusals,
 }
 
 impl SimulatedRobot {
@@ -67,13 +69,25 @@ impl SimulatedRobot {
             clock,
             body_names: robot.body_names.clone(),
             is_legged: setup.is_legged(),
+            refusals: Refusals::default(),
         })
     }
 }
 
 impl Plant for SimulatedRobot {
     fn accept(&mut self, command: &Command) -> bool {
-        self.plant.accept(command).is_ok()
+        let taken = self.plant.accept(command);
+        if let Err(error) = &taken {
+            let kind = match error {
+                CommandRefused::Message(error) => error.code(),
+                CommandRefused::OutOfOrder { .. } => 100,
+                CommandRefused::JumpAhead { .. } => 101,
+                CommandRefused::TooEarly { .. } => 102,
+                _ => 103,
+            };
+            self.refusals.tell(kind, || format!("a command is refused: {error}"));
+        }
+        taken.is_ok()
     }
 
     fn step(&mut self) -> Result<(), String> {
@@ -309,7 +323,6 @@ fn config(setup: &Setup, holding: &Holding, start: &Start) -> Result<PlantConfig
         false => ActuatorLimits::NONE,
     });
     let stance = robot.soles.iter().position(|sole| sole.name == scenario.robot.stance.first());
-    let pushes = scenario.push.iter().filter(|push| push.impulse_ns > 0.0);
     Ok(PlantConfig {
         time_step: plant.step_s,
         errors: ModelErrors {
@@ -331,7 +344,7 @@ fn config(setup: &Setup, holding: &Holding, start: &Start) -> Result<PlantConfig
         terrain: terrain(scenario),
         contact: ContactOptions { ground: ground(setup), ..ContactOptions::default() },
         sensors: sensors(setup)?,
-        pushes: pushes.map(|push| made_push(robot, push, start)).collect::<Result<_, _>>()?,
+        pushes: pushes(setup)?,
         watchdog: held_by(holding, &start.q),
         monitor: monitor(setup, stance.unwrap_or(0)),
         seed: scenario.seed,
@@ -448,6 +461,16 @@ fn sensors(setup: &Setup) -> Result<SensorConfig, Failure> {
         noise_scale: settings.noise_scale,
         ..there
     })
+}
+
+/// The pushes of a scenario, in the world.
+///
+/// # Errors
+/// [`Failure::Input`] for a link that is fixed to the world.
+pub fn pushes(setup: &Setup) -> Result<Vec<simulation::Push>, Failure> {
+    let start = setup.start()?;
+    let pushes = setup.scenario.push.iter().filter(|push| push.impulse_ns > 0.0);
+    pushes.map(|push| made_push(&setup.robot, push, &start)).collect()
 }
 
 fn made_push(robot: &RobotModel, push: &PushSettings, start: &Start) -> Result<simulation::Push, Failure> {

@@ -14,7 +14,7 @@
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, IsTerminal, Read, Write};
-use std::os::unix::process::ExitStatusExt;
+use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::PathBuf;
 use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -26,9 +26,9 @@ use delmpc_controller_process::presence::{Peer, Presence};
 use delmpc_controller_process::stop::StopFlag;
 use delmpc_messages::{ProcessState, Role};
 use delmpc_transport::{RunId, RunNode, remove_leftovers};
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::process::{Pid, Signal, kill_process, kill_process_group};
 
-use crate::output::printable;
+use crate::output::{self, printable};
 use crate::output_file;
 use crate::verdict::Failure;
 
@@ -50,6 +50,20 @@ const END_PATIENCE_S: f64 = 3.0;
 /// The way to a plant that is steered; empty until it is started.
 pub type PlantPipe = Arc<Mutex<Option<ChildStdin>>>;
 
+/// Who plays a role.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Program {
+    /// `delmpc plant`, `delmpc controller`.
+    Ours,
+    /// A command of somebody else's, run by the shell.
+    Foreign {
+        /// The command.
+        command: String,
+        /// What it is told in its environment.
+        environment: Vec<(&'static str, String)>,
+    },
+}
+
 /// One run's two processes, and how to start them.
 #[derive(Debug)]
 pub struct Supervision {
@@ -57,6 +71,10 @@ pub struct Supervision {
     pub run: RunId,
     /// Our program.
     pub program: PathBuf,
+    /// Who plays the plant.
+    pub plant: Program,
+    /// Who plays the controller.
+    pub controller: Program,
     /// Arguments of each process after its role's name.
     pub arguments: Vec<String>,
     /// Where what the processes say is kept.
@@ -67,7 +85,7 @@ pub struct Supervision {
     pub steering: Option<PlantPipe>,
     /// A process that is silent for this long has failed, s.
     pub hang_s: f64,
-    /// In lockstep the wall clock decides nothing: only a process that somebody has stopped, and that is silent for that long, has failed.
+    /// In lockstep the wall clock decides nothing: a process that somebody has stopped is waited for.
     pub lockstep: bool,
     /// How often a controller that was killed is started again, within the same run.
     pub restarts: u32,
@@ -116,6 +134,10 @@ struct Watched {
     said: Arc<Mutex<String>>,
     /// Time it had on a core when it gave its last sign of life, s.
     used_s: f64,
+    /// It is a shell with a command of somebody else's.
+    foreign: bool,
+    /// Somebody has stopped it, and that was said.
+    paused: bool,
 }
 
 /// What the operating system knows of a process.
@@ -141,8 +163,9 @@ impl Activity {
     /// a core since its last sign of life.
     fn hangs(&self, used_s: f64, hang_s: f64, lockstep: bool) -> bool {
         match self.state {
-            'T' | 't' => true,
+            // In lockstep the clock of the robot stands still with it: somebody looks at it with a debugger.
             _ if lockstep => false,
+            'T' | 't' => true,
             'R' | 'D' => self.used_s - used_s > 0.5 * hang_s,
             _ => true,
         }
@@ -150,13 +173,36 @@ impl Activity {
 }
 
 impl Watched {
+    /// What the process does: the one that speaks, when a shell has started it.
+    fn activity(&self) -> Activity {
+        Activity::of(self.peer.pid().filter(|_| self.foreign).unwrap_or_else(|| self.child.id()))
+    }
+
+    /// Says once that the run waits for a process that somebody has stopped.
+    fn tell_of_a_pause(&mut self, activity: &Activity) {
+        let stopped = matches!(activity.state, 'T' | 't');
+        if stopped && !self.paused {
+            let (name, pid) = (self.role.name(), self.child.id());
+            output::say(&format!("run: the {name} process (pid {pid}) is stopped; the run waits for it"));
+        }
+        self.paused = stopped;
+    }
+
+    /// Sends a signal; to everybody whom a command of somebody else's has started.
+    fn signal(&self, signal: Signal) {
+        if let Some(pid) = Pid::from_raw(self.child.id() as i32) {
+            let _ = if self.foreign { kill_process_group(pid, signal) } else { kill_process(pid, signal) };
+        }
+    }
+
     /// What a process that has ended said last, if that was why.
     fn last_words(&mut self) -> String {
         if let Some(listener) = self.listener.take() {
             let _ = listener.join();
         }
         let said = self.said.lock().unwrap_or_else(PoisonError::into_inner);
-        said.strip_prefix("delmpc: ").map_or(String::new(), |why| format!(": {why}"))
+        let why = said.strip_prefix("delmpc: ").or_else(|| self.foreign.then_some(said.as_str()));
+        why.filter(|why| !why.is_empty()).map_or(String::new(), |why| format!(": {why}"))
     }
 }
 
@@ -254,10 +300,8 @@ impl Supervision {
     fn start(&self, node: &RunNode, role: Role, messages: &Arc<Mutex<File>>) -> Result<Watched, Failure> {
         let peer = Peer::new(node, role).map_err(Failure::fault)?;
         let steering = self.steering.as_ref().filter(|_| role == Role::Plant);
-        let mut child = Command::new(&self.program)
-            .arg(role.name())
-            .args(&self.arguments)
-            .args(["--run-id", &self.run.to_string(), "--supervised"])
+        let mut child = self
+            .command(role)
             .args(steering.map(|_| "--steered"))
             .stdin(if steering.is_some() { Stdio::piped() } else { Stdio::null() })
             .stdout(Stdio::null())
@@ -283,7 +327,27 @@ impl Supervision {
         if let Some(pipe) = steering {
             *pipe.lock().unwrap_or_else(PoisonError::into_inner) = child.stdin.take();
         }
-        Ok(Watched { role, child, peer, ended: None, listener, said, used_s: 0.0 })
+        let foreign = *self.program_of(role) != Program::Ours;
+        Ok(Watched { role, child, peer, ended: None, listener, said, used_s: 0.0, foreign, paused: false })
+    }
+
+    fn program_of(&self, role: Role) -> &Program {
+        if role == Role::Plant { &self.plant } else { &self.controller }
+    }
+
+    /// What to start for a role.
+    fn command(&self, role: Role) -> Command {
+        if let Program::Foreign { command, environment } = self.program_of(role) {
+            let mut shell = Command::new("/bin/sh");
+            shell.args(["-c", command]).envs(environment.iter().map(|(name, value)| (*name, value)));
+            // So that whatever it starts ends with it; and so that Ctrl-C is for us to pass on.
+            shell.process_group(0);
+            return shell;
+        }
+        let mut command = Command::new(&self.program);
+        command.arg(role.name()).args(&self.arguments);
+        command.args(["--run-id", &self.run.to_string(), "--supervised"]);
+        command
     }
 
     /// How the run stands; `None`: it goes on.
@@ -318,9 +382,12 @@ impl Supervision {
             // Who has announced the end gives no further sign: what is left is to write the log.
             let ending = matches!(state, Some(ProcessState::Finished | ProcessState::Stopping));
             let patience_s = if ending { self.hang_s.max(FINISH_PATIENCE_S) } else { self.hang_s };
-            let activity = Activity::of(pid);
+            let activity = process.activity();
             if silent_s < SILENCE_S {
                 process.used_s = activity.used_s;
+            }
+            if self.lockstep && silent_s > self.hang_s {
+                process.tell_of_a_pause(&activity);
             }
             if !starting
                 && silent_s > patience_s
@@ -349,14 +416,9 @@ fn is_killed(process: &mut Watched) -> bool {
 fn end_all(processes: &mut [Watched], presence: &mut Presence) {
     // A broken link leaves the signals.
     let _ = presence.announce(ProcessState::Stopping);
-    let signal = |process: &Watched, signal: Signal| {
-        if let (None, Some(pid)) = (process.ended, Pid::from_raw(process.child.id() as i32)) {
-            let _ = kill_process(pid, signal);
-        }
-    };
-    for process in processes.iter() {
-        signal(process, Signal::TERM);
-        signal(process, Signal::CONT); // a stopped process hears nothing
+    for process in processes.iter().filter(|process| process.ended.is_none()) {
+        process.signal(Signal::TERM);
+        process.signal(Signal::CONT); // a stopped process hears nothing
     }
     let begin = monotonic_ns();
     loop {
@@ -371,6 +433,7 @@ fn end_all(processes: &mut [Watched], presence: &mut Presence) {
         sleep(LOOK);
     }
     for process in processes.iter_mut().filter(|process| process.ended.is_none()) {
+        process.signal(Signal::KILL);
         let _ = process.child.kill();
         process.ended = process.child.wait().ok();
     }
@@ -415,7 +478,7 @@ mod tests {
         let hangs = |state, used_s, lockstep| Activity { state, used_s }.hangs(1.0, 2.0, lockstep);
         assert!(!hangs('R', 1.5, false) && !hangs('D', 1.0, false));
         assert!(hangs('R', 2.5, false) && hangs('S', 1.0, false) && hangs('T', 1.0, false));
-        assert!(!hangs('R', 9.0, true) && !hangs('S', 1.0, true) && hangs('T', 1.0, true));
+        assert!(!hangs('R', 9.0, true) && !hangs('S', 1.0, true) && !hangs('T', 1.0, true));
         let own = Activity::of(std::process::id());
         assert!("RSD".contains(own.state) && own.used_s >= 0.0, "{own:?}");
     }

@@ -116,6 +116,10 @@ impl Controller for TapedController {
         self.input.command = checksum(self.controller.command());
         self.inputs.keep(*self.input);
     }
+
+    fn reason_in_words(&self, reason: u32) -> &'static str {
+        self.controller.reason_in_words(reason)
+    }
 }
 
 /// Of all that the plant acts on.

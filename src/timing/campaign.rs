@@ -26,7 +26,7 @@ use crate::one_process::{Simulated, simulate};
 use crate::run_folder::RunFolder;
 use crate::setup::Setup;
 use crate::summary::{PlantPart, Summary};
-use crate::supervisor::{Course, ProcessIds, Supervision, fresh_run};
+use crate::supervisor::{Course, ProcessIds, Program, Supervision, fresh_run};
 use crate::timing::loop_phase::{path_text, take_parts};
 use crate::verdict::Failure;
 
@@ -218,6 +218,8 @@ fn supervision(setup: &Setup, folder: &RunFolder, fault: &FaultSettings) -> Resu
     Ok(Supervision {
         run: fresh_run()?,
         program: delmpc_program()?,
+        plant: Program::Ours,
+        controller: Program::Ours,
         arguments: vec![
             path_text(&folder.file("scenario.toml"))?,
             "--out".to_owned(),

@@ -13,7 +13,7 @@ use crate::run_folder::{
 };
 use crate::setup::Setup;
 use crate::summary::{ControllerPart, PlantPart, Summary};
-use crate::supervisor::{Course, Supervision, fresh_run};
+use crate::supervisor::{Course, Program, Supervision, fresh_run};
 use crate::timing::again::Tape;
 use crate::timing::floor::{FloorRun, FloorSettings, FloorThread, WITNESS_NS, Work};
 use crate::verdict::Failure;
@@ -49,6 +49,8 @@ pub fn run_loop(setup: &Setup, folder: &Path, stop: &StopFlag) -> Result<LoopRun
     let supervision = Supervision {
         run: fresh_run()?,
         program: std::env::current_exe().map_err(Failure::fault)?,
+        plant: Program::Ours,
+        controller: Program::Ours,
         arguments: vec![
             path_text(&folder.file("scenario.toml"))?,
             "--out".to_owned(),

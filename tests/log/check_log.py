@@ -63,6 +63,53 @@ def decode(schema, data):
     return fields
 
 
+class Cdr:
+    """Reads ROS 2's encoding: alignment from behind the header of four bytes."""
+
+    def __init__(self, data):
+        self.data, self.at = data[4:], 0
+
+    def take(self, letter, size, count=1):
+        self.at += -self.at % size
+        values = struct.unpack_from(f"<{count}{letter}", self.data, self.at)
+        self.at += size * count
+        return values
+
+    def text(self):
+        (length,) = self.take("I", 4)
+        text = self.data[self.at : self.at + length]
+        self.at += length
+        assert text.endswith(b"\0"), text
+        return text[:-1].decode()
+
+
+def transforms(data):
+    """Child and parent of every transform of a TFMessage; each a turn and a finite place."""
+    cdr, frames = Cdr(data), {}
+    for _ in range(cdr.take("I", 4)[0]):
+        cdr.take("I", 4, 2)
+        parent, child = cdr.text(), cdr.text()
+        *place, x, y, z, w = cdr.take("d", 8, 7)
+        assert abs(x * x + y * y + z * z + w * w - 1) < 1e-9 and all(abs(p) < 1e3 for p in place), (child, place)
+        frames[child] = parent
+    assert cdr.at == len(cdr.data)
+    return frames
+
+
+def joint_names(data):
+    """Names of a JointState, which has three numbers for each."""
+    cdr = Cdr(data)
+    cdr.take("I", 4, 2)
+    assert cdr.text() == ""
+    names = [cdr.text() for _ in range(cdr.take("I", 4)[0])]
+    for _ in range(3):
+        (count,) = cdr.take("I", 4)
+        assert count == len(names)
+        cdr.take("d", 8, count)
+    assert cdr.at == len(cdr.data)
+    return names
+
+
 def matches(schema, value, where):
     """Whether a JSON value is what its JSON schema says (type, properties, items)."""
     kinds = {"object": dict, "array": list, "string": str, "boolean": bool, "integer": int, "number": (int, float)}
@@ -87,11 +134,14 @@ def main(folder):
         for schema, channel, message in reader.iter_messages():
             seen[channel.topic] += 1
             if schema.encoding == "jsonschema":
-                value = json.loads(message.data)
-                matches(json.loads(schema.data), value, channel.topic)
-                if channel.topic == "/tf":
-                    moments.append(message.log_time)
-                    frames = {transform["child_frame_id"]: transform["parent_frame_id"] for transform in value["transforms"]}
+                matches(json.loads(schema.data), json.loads(message.data), channel.topic)
+            elif channel.topic == "/tf":
+                assert (schema.name, schema.encoding, channel.message_encoding) == ("tf2_msgs/msg/TFMessage", "ros2msg", "cdr")
+                moments.append(message.log_time)
+                frames = transforms(message.data)
+            elif channel.topic == "/joint_states":
+                assert schema.name == "sensor_msgs/msg/JointState", schema.name
+                joints = joint_names(message.data)
             elif channel.topic == "/plant/truth":
                 last_truth = decode(schema, message.data)
                 assert last_truth["time_ns"] == message.log_time
@@ -109,7 +159,8 @@ def main(folder):
     assert counts["/controller/command"] == summary["cycles"], counts
     # One state for each cycle, and the last one, which says that the run is over.
     assert counts["/plant/state"] == summary["cycles"] + 1, counts
-    assert counts["/robot"] == 1 and counts["/tf"] == counts["/forces"], counts
+    assert counts["/robot"] == 1 and counts["/tf"] == counts["/forces"] == counts["/joint_states"], counts
+    assert joints == about["joints"].split(), joints
     rate = 30 * summary["duration_s"]
     assert abs(counts["/tf"] - rate) <= 2 + 0.02 * rate, (counts, rate)
     assert abs(last_truth["time_ns"] * 1e-9 - summary["duration_s"]) < 1e-6

@@ -11,7 +11,7 @@
 use std::thread::sleep;
 use std::time::Duration;
 
-use delmpc_messages::{Command, PlantState, ProcessState, status};
+use delmpc_messages::{Command, PlantState, ProcessState, Verdict, status};
 use delmpc_scenario::{Clock, Scenario};
 use delmpc_transport::{LinkError, Publisher, Subscriber};
 
@@ -19,6 +19,7 @@ use crate::clock::{Tick, Ticker, monotonic_ns};
 use crate::figures::{CycleFigure, CycleFigures};
 use crate::membership::{Attendance, Order};
 use crate::records::{CycleRecord, Records};
+use crate::refusals::Refusals;
 use crate::usage::Usage;
 
 /// What computes a command from a state.
@@ -30,6 +31,11 @@ pub trait Controller {
     /// What can be done for the next cycle before its state is there; called after a command was sent. The times it took belong in
     /// the report of the cycle it is for, in the total too.
     fn prepare(&mut self) {}
+
+    /// What a reason of its own, from 100 on, stands for ([`Command::reason`]).
+    fn reason_in_words(&self, _reason: u32) -> &'static str {
+        "a reason of the controller's own"
+    }
 }
 
 /// How a loop ended.
@@ -63,6 +69,7 @@ pub struct ControllerLoop<'a, S, P> {
     figures: CycleFigures,
     /// Every cycle with its times, when somebody wants them.
     records: Records<CycleRecord>,
+    refusals: Refusals,
 }
 
 impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S, P> {
@@ -78,6 +85,7 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
             allocations: None,
             figures: CycleFigures::new(),
             records: Records::none(),
+            refusals: Refusals::default(),
         }
     }
 
@@ -207,7 +215,13 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
                 *self.state = *state;
                 Ok(true)
             }
-            _ => Ok(false),
+            Some(state) => {
+                if let Err(error) = state.header.validate_run::<PlantState>(run_id) {
+                    self.refusals.tell(error.code(), || format!("a state is refused: {error}"));
+                }
+                Ok(false)
+            }
+            None => Ok(false),
         }
     }
 
@@ -264,6 +278,9 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
         }
         self.commands.send(command)?;
         let sent_ns = monotonic_ns();
+        if command.verdict() == Some(Verdict::BadState) {
+            tell_why(&mut self.refusals, controller, &self.state, command);
+        }
         let feedback_ns = computed_ns - if realtime { tick.due_ns.min(begin_ns) } else { begin_ns };
         let figure = CycleFigure {
             total_ns: feedback_ns + ahead_ns,
@@ -288,6 +305,20 @@ impl<'a, S: Subscriber<PlantState>, P: Publisher<Command>> ControllerLoop<'a, S,
         }
         Ok(sent_ns)
     }
+}
+
+/// Says why a state was refused.
+fn tell_why(refusals: &mut Refusals, controller: &impl Controller, state: &PlantState, command: &Command) {
+    let (reason, sequence) = (command.reason, state.header.sequence);
+    refusals.tell(reason, || {
+        match state.validate(command.header.joint_set_hash, command.n_joints as usize) {
+            Err(error) if error.code() == reason => format!("state {sequence} is refused: {error}"),
+            _ => format!(
+                "state {sequence} is refused: {} (reason {reason})",
+                controller.reason_in_words(reason)
+            ),
+        }
+    });
 }
 
 /// More than a controller counts in a run: a number of the plant's that is farther ahead than this is damaged.

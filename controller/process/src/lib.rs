@@ -22,5 +22,6 @@ pub mod machine;
 pub mod membership;
 pub mod presence;
 pub mod records;
+pub mod refusals;
 pub mod stop;
 pub mod usage;

@@ -123,6 +123,15 @@ impl Membership {
         }
     }
 
+    /// What connecting a channel gave; that it failed is told to the others before we go.
+    pub fn connected<T>(&mut self, channel: Result<T, LinkError>) -> Result<T, LinkError> {
+        if channel.is_err() {
+            // A broken link leaves our own words.
+            let _ = self.presence.announce_refusal();
+        }
+        channel
+    }
+
     /// The run's shared memory.
     pub fn node(&self) -> &RunNode {
         &self.node

@@ -1,6 +1,6 @@
 //! Signs of life: giving our own, following those of others.
 
-use delmpc_messages::{Heartbeat, ProcessState, Role};
+use delmpc_messages::{FAULT_REFUSED, Heartbeat, ProcessState, Role};
 use delmpc_transport::{
     Channel, LinkError, Publisher, RunNode, SharedPublisher, SharedSubscriber, Subscriber,
 };
@@ -9,9 +9,10 @@ use rustix::io::Errno;
 use rustix::process::{Pid, test_kill_process};
 
 use crate::clock::monotonic_ns;
+use crate::refusals::Refusals;
 
 /// Time between signs of life.
-const PERIOD_NS: u64 = 20_000_000;
+pub const PERIOD_NS: u64 = 20_000_000;
 
 /// Our own signs of life. They come from the loop that does the work, so that a loop that hangs falls silent.
 #[derive(Debug)]
@@ -56,6 +57,15 @@ impl Presence {
         self.send()
     }
 
+    /// Announces that we do not fit to the others and go.
+    ///
+    /// # Errors
+    /// When the channel is broken.
+    pub fn announce_refusal(&mut self) -> Result<(), LinkError> {
+        self.heartbeat.fault_code = FAULT_REFUSED;
+        self.announce(ProcessState::Fault)
+    }
+
     fn send(&mut self) -> Result<(), LinkError> {
         self.heartbeat.header.sequence += 1;
         self.heartbeat.time_ns = monotonic_ns();
@@ -76,6 +86,8 @@ pub struct Peer {
     latest: Option<Heartbeat>,
     looked_ns: u64,
     silent_ns: u64,
+    role: Role,
+    refusals: Refusals,
 }
 
 impl Peer {
@@ -85,7 +97,9 @@ impl Peer {
     /// When the channel cannot be opened.
     pub fn new(node: &RunNode, role: Role) -> Result<Self, LinkError> {
         let subscriber = node.subscriber(Channel::Heartbeat(role))?;
-        Ok(Self { subscriber, joint_set_hash: None, latest: None, looked_ns: monotonic_ns(), silent_ns: 0 })
+        let refusals = Refusals::default();
+        let looked_ns = monotonic_ns();
+        Ok(Self { subscriber, joint_set_hash: None, latest: None, looked_ns, silent_ns: 0, role, refusals })
     }
 
     /// Follows it only with these joints: another one is refused by both, and neither its coming nor its going means anything.
@@ -107,9 +121,23 @@ impl Peer {
             let sequence = heartbeat.header.sequence;
             let news = self.latest.is_none_or(|latest| latest.header.sequence != sequence);
             let expected = self.joint_set_hash.unwrap_or(heartbeat.header.joint_set_hash);
-            if news && heartbeat.validate(expected).is_ok() {
-                self.latest = Some(*heartbeat);
-                self.silent_ns = 0;
+            let name = self.role.name();
+            if heartbeat.state() == Some(ProcessState::Fault) && heartbeat.fault_code == FAULT_REFUSED {
+                // It never was one of us.
+                self.latest = None;
+                self.refusals.tell(FAULT_REFUSED, || {
+                    format!("a {name} process could not connect: its messages are of another version, or its services have other settings")
+                });
+            } else if news {
+                match heartbeat.validate(expected) {
+                    Ok(()) => {
+                        self.latest = Some(*heartbeat);
+                        self.silent_ns = 0;
+                    }
+                    Err(error) => self
+                        .refusals
+                        .tell(100 + error.code(), || format!("a {name} process is refused: {error}")),
+                }
             }
         }
         Ok(())

@@ -3,7 +3,7 @@
 use crate::{LATEST_TIME_NS, MAX_JOINTS, MessageError};
 
 /// A quaternion whose squared length differs more than this from 1 was not normalised.
-const UNIT_TOLERANCE: f64 = 1e-6;
+pub const UNIT_TOLERANCE: f64 = 1e-6;
 
 /// Every value finite and of a magnitude up to `limit`.
 pub(crate) fn plausible(

@@ -227,6 +227,27 @@ pub enum MessageError {
 }
 
 impl MessageError {
+    /// Every kind by its name, with its number.
+    pub const CODES: [(&'static str, u32); 17] = [
+        ("WrongMagic", 1),
+        ("WrongVersion", 2),
+        ("WrongJointSet", 3),
+        ("WrongJointCount", 4),
+        ("NotFinite", 5),
+        ("Implausible", 6),
+        ("NotUnit", 7),
+        ("UnknownCode", 8),
+        ("EmptyInterval", 9),
+        ("WrongLength", 10),
+        ("EmptyBounds", 11),
+        ("WrongSegmentCount", 12),
+        ("SegmentOutOfOrder", 13),
+        ("TimeBeyond", 14),
+        ("ValidTooLong", 15),
+        ("WrongRun", 16),
+        ("TooManyFeet", 17),
+    ];
+
     /// A number for [`crate::Command::reason`], never 0. It stays the same from version to version.
     pub fn code(&self) -> u32 {
         match self {

@@ -22,9 +22,12 @@ pub struct Heartbeat {
     pub pid: u32,
     /// What it is doing: [`ProcessState`].
     pub state: u32,
-    /// Why it stopped when `state` is [`ProcessState::Fault`]: a number of the process's own; otherwise 0.
+    /// Why it stopped when `state` is [`ProcessState::Fault`]: [`FAULT_REFUSED`], or a number of the process's own; otherwise 0.
     pub fault_code: u32,
 }
+
+/// [`Heartbeat::fault_code`] of a process that could not connect: its payloads, their versions or the settings of its services differ.
+pub const FAULT_REFUSED: u32 = 1;
 
 message!(Heartbeat, "delmpc/Heartbeat/v1", b"DMHB", 1);
 

@@ -34,11 +34,12 @@ mod joint_set;
 mod plant_state;
 mod servo_law;
 
+pub use check::UNIT_TOLERANCE;
 pub use command::{Command, FallbackLevel, MAX_SEGMENTS, Segment, StateEstimate, Verdict};
 pub use cycle_report::{ConstraintKind, CycleReport};
 pub use error::MessageError;
 pub use header::{Header, Message};
-pub use heartbeat::{Heartbeat, ProcessState, Role};
+pub use heartbeat::{FAULT_REFUSED, Heartbeat, ProcessState, Role};
 pub use joint_set::{JointSetHasher, joint_set_hash};
 pub use plant_state::{ClockKind, FootReading, MAX_FEET, PlantState, foot, sensor, status};
 pub use servo_law::{MAX_RATE_SAMPLES, RateMean, ServoReadings};

@@ -472,6 +472,8 @@ fn status_flags_are_single_bits() {
 #[test]
 fn codes_of_refusals_are_never_zero() {
     assert_eq!(state_error(|s| s.header.magic = 0).code(), 1);
+    let known = |code: u32| MessageError::CODES.iter().filter(|(_, known)| *known == code).count();
+    assert!((1..=MessageError::CODES.len() as u32).all(|code| known(code) == 1));
     assert_eq!(state_error(|s| s.position[0] = f64::NAN).code(), 5);
     assert_eq!(state_error(|s| s.position[0] = 1e300).code(), 6);
 }

@@ -13,7 +13,9 @@ use crate::RunId;
 #[non_exhaustive]
 pub enum LinkError {
     /// The text is no run identity.
-    #[error("'{text}' is no run id: 16 hexadecimal digits are expected, as the supervisor prints them")]
+    #[error(
+        "'{text}' is no run id: 16 hexadecimal digits are expected, or a name of up to 64 letters, digits, '.', '_' and '-', such as bench-3"
+    )]
     InvalidRunId {
         /// The text.
         text: String,

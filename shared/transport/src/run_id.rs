@@ -4,13 +4,17 @@ use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-use crate::LinkError;
+use delmpc_messages::joint_set_hash;
+
 use crate::private_root::{random_number, runtime_folder, shared_number};
+use crate::{Channel, LinkError};
 
 /// All names of ours in shared memory begin with this.
 const FAMILY: &str = "delmpc_";
+/// Longest name of a run that somebody chooses.
+const LONGEST_NAME: usize = 64;
 
-/// The identity of one run. Written as 16 hexadecimal digits.
+/// The identity of one run. Written as 16 hexadecimal digits; a name stands for its hash ([`RunId::of_name`]).
 ///
 /// # Example
 /// ```
@@ -39,13 +43,35 @@ impl RunId {
         shared_number(text).map(Self)
     }
 
+    /// The identity that anybody makes alike from a name: its FNV-1a hash, as of a set of one joint.
+    ///
+    /// # Errors
+    /// [`LinkError::InvalidRunId`] for a name that is empty, longer than 64 characters, holds others than letters, digits, `.`, `_`, `-`, or
+    /// could be a number that lacks digits.
+    pub fn of_name(name: &str) -> Result<Self, LinkError> {
+        let plain = |byte: u8| byte.is_ascii_alphanumeric() || b"._-".contains(&byte);
+        let is_a_number = name.bytes().all(|byte| byte.is_ascii_hexdigit());
+        match name.len() <= LONGEST_NAME && name.bytes().all(plain) && !is_a_number {
+            true => Ok(Self(joint_set_hash(&[name]))),
+            false => Err(LinkError::InvalidRunId { text: name.to_owned() }),
+        }
+    }
+
+    /// The name of a channel's service.
+    pub fn service_name(self, channel: Channel) -> String {
+        format!("delmpc/{self}/{}", channel.name())
+    }
+
     /// The beginning of every name this run has in shared memory.
-    pub(crate) fn prefix(self) -> String {
+    pub fn prefix(self) -> String {
         format!("{FAMILY}{self}_")
     }
 
     /// The folder in which this run keeps its service files, within the user's private folder.
-    pub(crate) fn root_path(self) -> Result<PathBuf, LinkError> {
+    ///
+    /// # Errors
+    /// [`LinkError::NotPrivate`], [`LinkError::NoRuntimeFolder`].
+    pub fn root_path(self) -> Result<PathBuf, LinkError> {
         Ok(runtime_folder()?.join(self.to_string()))
     }
 
@@ -67,7 +93,7 @@ impl FromStr for RunId {
     fn from_str(text: &str) -> Result<Self, LinkError> {
         let digits = text.len() == 16 && text.bytes().all(|byte| byte.is_ascii_hexdigit());
         let value = u64::from_str_radix(text, 16).ok().filter(|_| digits);
-        value.map(Self).ok_or_else(|| LinkError::InvalidRunId { text: text.to_owned() })
+        value.map(Self).map_or_else(|| Self::of_name(text), Ok)
     }
 }
 
@@ -80,9 +106,17 @@ mod tests {
         let run = RunId(0x12ab);
         assert_eq!(run.to_string(), "00000000000012ab");
         assert_eq!("00000000000012ab".parse::<RunId>().unwrap(), run);
-        for text in ["", "12ab", "+0000000000012ab", "00000000000012ag", "00000000000012ab0"] {
+        for text in
+            ["", "12ab", "+0000000000012ab", "00000000000012ab0", "two words", "../x", "é", &"x".repeat(65)]
+        {
             assert!(matches!(text.parse::<RunId>(), Err(LinkError::InvalidRunId { .. })), "{text:?}");
         }
+    }
+
+    #[test]
+    fn a_name_is_the_hash_that_another_language_makes_of_it() {
+        // FNV-1a over "bench-3" and one byte 0xff, computed by hand in Python.
+        assert_eq!("bench-3".parse::<RunId>().unwrap().to_string(), "5976d8699b458526");
     }
 
     #[test]

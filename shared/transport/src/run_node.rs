@@ -25,13 +25,13 @@ use crate::memory::{NEEDED, check_free, keep_to_ourselves, reserve};
 use crate::shared_link::MOST_BORROWED;
 use crate::{Channel, LinkError, Payload, RunId, SharedPublisher, SharedSubscriber};
 
-const MAX_SUBSCRIBERS: usize = 8;
-const MAX_PROCESSES: usize = 16;
+/// Places for processes of a run on a channel.
+pub const MAX_PROCESSES: usize = 16;
 /// Publishers that are gone of which a subscriber still holds messages: one gives out one message and looks at another. Every look for a
 /// message goes through the room for them, so that iceoryx2's 128 cost a tenth of a microsecond each time.
 const MAX_LOST_PUBLISHERS: usize = 2;
 /// The attribute of a channel that says which joints it is about.
-const JOINT_SET: &str = "joint_set_hash";
+pub const JOINT_SET: &str = "joint_set_hash";
 /// A peer that is just being started, ended or cleaned up after a kill makes opening fail for a moment; on a machine whose cores are all
 /// taken, for seconds. Longer than it takes until a half-made file counts as lost.
 const CONNECT_PATIENCE: Duration = Duration::from_secs(20);
@@ -108,9 +108,26 @@ impl RunNode {
     /// # Errors
     /// As [`Self::publisher`], with at most eight subscribers on a channel.
     pub fn subscriber<T: Payload>(&self, channel: Channel) -> Result<SharedSubscriber<T>, LinkError> {
+        self.subscriber_with_buffer(channel, 1)
+    }
+
+    /// A receiving end that keeps as many messages as the channel has room for: read it by [`SharedSubscriber::receive_next`].
+    ///
+    /// # Errors
+    /// As [`Self::subscriber`].
+    pub fn recorder<T: Payload>(&self, channel: Channel) -> Result<SharedSubscriber<T>, LinkError> {
+        self.subscriber_with_buffer(channel, channel.buffer_size())
+    }
+
+    fn subscriber_with_buffer<T: Payload>(
+        &self,
+        channel: Channel,
+        buffer_size: usize,
+    ) -> Result<SharedSubscriber<T>, LinkError> {
         without_waiting_for_the_lost(self.run, || {
             let service = self.service::<T>(channel)?;
-            self.insist(PORT_PATIENCE, || match service.subscriber_builder().create() {
+            let create = || service.subscriber_builder().buffer_size(buffer_size).create();
+            self.insist(PORT_PATIENCE, || match create() {
                 Ok(port) => Attempt::Done(SharedSubscriber::new(port, channel.name())),
                 Err(SubscriberCreateError::ExceedsMaxSupportedSubscribers) => {
                     Attempt::TryAgain(self.occupied(channel, "subscriber"))
@@ -136,10 +153,10 @@ impl RunNode {
                 .publish_subscribe::<T>()
                 .enable_safe_overflow(true)
                 .history_size(1)
-                .subscriber_max_buffer_size(1)
+                .subscriber_max_buffer_size(channel.buffer_size())
                 .subscriber_max_borrowed_samples(MOST_BORROWED)
                 .max_publishers(1)
-                .max_subscribers(MAX_SUBSCRIBERS)
+                .max_subscribers(channel.max_subscribers())
                 .max_nodes(MAX_PROCESSES)
                 .open_or_create_with_attributes(&required);
             match opened {
@@ -166,7 +183,7 @@ impl RunNode {
     }
 
     fn service_name(&self, channel: Channel) -> Result<ServiceName, LinkError> {
-        let name = format!("delmpc/{}/{}", self.run, channel.name());
+        let name = self.run.service_name(channel);
         ServiceName::new(&name).map_err(|error| self.refused(channel, &error))
     }
 

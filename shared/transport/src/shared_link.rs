@@ -38,7 +38,7 @@ pub struct SharedSubscriber<T: Payload> {
 const RETURNED_TOGETHER: usize = 4;
 
 /// Messages a subscriber has at most: those not given back yet, and the one being looked at.
-pub(crate) const MOST_BORROWED: usize = RETURNED_TOGETHER + 1;
+pub const MOST_BORROWED: usize = RETURNED_TOGETHER + 1;
 
 /// Messages looked at per call. A publisher has no more than one waiting; there may be two when one was started anew after the other. Then
 /// the numbers have a gap: only after one is there a second look, for who polls wants an answer at once.
@@ -62,6 +62,40 @@ impl<T: Payload> SharedPublisher<T> {
 impl<T: Payload> SharedSubscriber<T> {
     pub(crate) fn new(port: SubscriberPort<ipc::Service, T, ()>, channel: &'static str) -> Self {
         Self { held: [const { None }; RETURNED_TOGETHER], next_place: 0, port, sequence: 0, channel }
+    }
+
+    /// The oldest message that was not given out yet: of a channel that keeps more than the latest one.
+    ///
+    /// # Errors
+    /// When shared memory is broken.
+    pub fn receive_next(&mut self) -> Result<Option<&T>, LinkError> {
+        self.receive(1)
+    }
+
+    /// Looks at up to `most` messages, up to one that follows the last one by its number.
+    fn receive(&mut self, most: usize) -> Result<Option<&T>, LinkError> {
+        if self.next_place == RETURNED_TOGETHER {
+            self.held = [const { None }; RETURNED_TOGETHER];
+            self.next_place = 0;
+        }
+        let place = &mut self.held[self.next_place];
+        for _ in 0..most {
+            let received = self.port.receive();
+            match received.map_err(|source| LinkError::Receive { channel: self.channel, source })? {
+                Some(sample) => {
+                    let sequence = sample.payload().header().sequence;
+                    let next = sequence == self.sequence.wrapping_add(1);
+                    self.sequence = sequence;
+                    *place = Some(sample);
+                    if next {
+                        break;
+                    }
+                }
+                None => break,
+            }
+        }
+        self.next_place += usize::from(place.is_some());
+        Ok(place.as_ref().map(|sample| sample.payload()))
     }
 }
 
@@ -88,27 +122,6 @@ impl<T: Payload> Publisher<T> for SharedPublisher<T> {
 
 impl<T: Payload> Subscriber<T> for SharedSubscriber<T> {
     fn receive_latest(&mut self) -> Result<Option<&T>, LinkError> {
-        if self.next_place == RETURNED_TOGETHER {
-            self.held = [const { None }; RETURNED_TOGETHER];
-            self.next_place = 0;
-        }
-        let place = &mut self.held[self.next_place];
-        for _ in 0..MOST_WAITING {
-            let received = self.port.receive();
-            match received.map_err(|source| LinkError::Receive { channel: self.channel, source })? {
-                Some(sample) => {
-                    let sequence = sample.payload().header().sequence;
-                    let next = sequence == self.sequence.wrapping_add(1);
-                    self.sequence = sequence;
-                    *place = Some(sample);
-                    if next {
-                        break;
-                    }
-                }
-                None => break,
-            }
-        }
-        self.next_place += usize::from(place.is_some());
-        Ok(place.as_ref().map(|sample| sample.payload()))
+        self.receive(MOST_WAITING)
     }
 }

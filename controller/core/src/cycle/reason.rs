@@ -18,3 +18,23 @@ pub const RICCATI: u32 = 112;
 pub const QP: u32 = 113;
 /// The plan is farther from the nominal than a linearisation reaches.
 pub const FAR: u32 = 114;
+
+/// A reason in words; what is not the controller's own is the message's.
+pub fn words(reason: u32) -> &'static str {
+    match reason {
+        STALE => "the measurement is too old",
+        OUT_OF_ORDER => "the measurement is from before the last one",
+        ESTIMATOR => "the estimator refused it",
+        AHEAD => {
+            "the measurement is from a time that has not come: believed, it would make all true ones look old"
+        }
+        PREDICTION => "the prediction to the time of the command failed",
+        STAGE => "a stage of the horizon could not be simulated",
+        RICCATI => "the Riccati recursion broke down",
+        QP => {
+            "the constrained QP gave nothing usable: no finite numbers, or torque limits and contact rows it could not keep"
+        }
+        FAR => "the plan is farther from the nominal than a linearisation reaches",
+        _ => "the message is damaged, or of another robot or version",
+    }
+}
