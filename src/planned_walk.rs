@@ -3,6 +3,9 @@
 //! A foot swings where the plan moves it: the stages in which it changes its place or leaves the ground, one after the other, are a step from
 //! the place before to the place after. A foot that merely carries nothing for a while stands.
 //!
+//! LittleDog follows a plan over level ground to its end. Where a plan has it on one foot or on none for a stage it falls: a foot that lands
+//! late leaves no time to wait for it.
+//!
 //! The plan is told in the world of the posture; the controller's is that of the stance frame at the start ([`crate::start`]).
 
 use delmpc_horizon::contact_schedule::Foothold;
