@@ -10,7 +10,7 @@ const RUN: &str = "run $REACH --set clock=lockstep --set duration_s=0.1 --no-rep
 #[test]
 fn short_shared_memory_is_a_sentence_with_the_size_needed() {
     let scratch = Scratch::new("shm");
-    for size in ["0k", "64k", "256k", "1m", "2000k"] {
+    for size in ["0k", "64k", "256k", "1m", "2000k", "4m"] {
         // tmpfs takes 0 for no limit.
         let size = if size == "0k" { "4k" } else { size };
         let script = format!(
@@ -21,7 +21,7 @@ fn short_shared_memory_is_a_sentence_with_the_size_needed() {
         ended.assert(3, &["/dev/shm has", "KiB are needed"]);
     }
     let script =
-        format!("mount -t tmpfs -o size=4m tmpfs /dev/shm && $DELMPC {RUN} {}/out", scratch.path().display());
+        format!("mount -t tmpfs -o size=7m tmpfs /dev/shm && $DELMPC {RUN} {}/out", scratch.path().display());
     if let Some(ended) = in_private_mounts("short_shared_memory", &script) {
         ended.assert(0, &[]);
     }
@@ -32,7 +32,7 @@ fn short_shared_memory_is_a_sentence_with_the_size_needed() {
 fn shared_memory_that_fills_up_meanwhile_is_no_sigbus() {
     let scratch = Scratch::new("shm-full");
     let script = format!(
-        "mount -t tmpfs -o size=5m tmpfs /dev/shm; cd /dev/shm
+        "mount -t tmpfs -o size=10m tmpfs /dev/shm; cd /dev/shm
         (while :; do head -c 4k /dev/zero >> filler 2>/dev/null; truncate -s 0 filler; head -c 3m /dev/zero > filler 2>/dev/null; done) & filler=$!
         for i in 1 2 3 4; do $DELMPC {RUN} {}/out$i; status=$?; [ $status = 0 ] || [ $status = 3 ] || exit $status; done
         kill $filler; exit 0",

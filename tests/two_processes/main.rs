@@ -89,7 +89,8 @@ fn a_killed_controller_is_a_fault() {
 fn a_process_that_stops_for_good_is_a_fault() {
     for role in ["plant", "controller"] {
         let folder = Folder::new(&format!("hang-{role}"));
-        let run = running(&folder, &["--set", "process.hang_s=0.5"]);
+        // In lockstep it may be in a debugger.
+        let run = running(&folder, &["--set", "process.hang_s=0.5", "--set", "clock=realtime"]);
         let family = children(run.pid());
         let pid = member(&family, role).pid;
         support::signal(pid, Signal::STOP);

@@ -123,9 +123,10 @@ impl Membership {
         }
     }
 
-    /// What connecting a channel gave; that it failed is told to the others before we go.
+    /// What connecting a channel gave; that the others do not fit is told to them before we go.
     pub fn connected<T>(&mut self, channel: Result<T, LinkError>) -> Result<T, LinkError> {
-        if channel.is_err() {
+        let short_of_memory = matches!(channel, Err(LinkError::SharedMemoryFull { .. }));
+        if channel.is_err() && !short_of_memory {
             // A broken link leaves our own words.
             let _ = self.presence.announce_refusal();
         }

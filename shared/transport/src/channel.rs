@@ -44,7 +44,7 @@ impl Channel {
     }
 
     /// Messages a subscriber may have waiting at most: of the truth all that a plant makes in a second.
-    pub fn buffer_size(self) -> usize {
+    pub const fn buffer_size(self) -> usize {
         match self {
             Self::Truth => TRUTHS_KEPT,
             Self::State | Self::Command => MESSAGES_KEPT,
@@ -53,7 +53,7 @@ impl Channel {
     }
 
     /// Places for subscribers.
-    pub fn max_subscribers(self) -> usize {
-        if self == Self::Truth { TRUTH_SUBSCRIBERS } else { MAX_SUBSCRIBERS }
+    pub const fn max_subscribers(self) -> usize {
+        if matches!(self, Self::Truth) { TRUTH_SUBSCRIBERS } else { MAX_SUBSCRIBERS }
     }
 }

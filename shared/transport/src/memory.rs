@@ -4,19 +4,27 @@ use std::fs::{self, OpenOptions, Permissions};
 use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::Path;
 
-use delmpc_messages::{Command, Heartbeat, PlantState};
+use delmpc_messages::{Command, Heartbeat, PlantState, Role};
 use rustix::fs::{FallocateFlags, OFlags, fallocate, statvfs};
 use rustix::io::Errno;
 
 use crate::abandoned::{SHARED_MEMORY, shared_memory_files};
-use crate::{LinkError, RunId};
+use crate::shared_link::MOST_BORROWED;
+use crate::{Channel, LinkError, RunId};
 
-/// Messages a channel has room for, with all its subscribers.
-const SLOTS: u64 = 64;
+/// Messages on their way beside those that subscribers keep and hold: lent to the publisher, and its history.
+const ON_THEIR_WAY: usize = 8;
 /// What a run takes in shared memory, bytes: a channel of states, one of commands, three of heartbeats, and some pages of bookkeeping.
-pub(crate) const NEEDED: u64 = SLOTS
-    * (size_of::<Command>() + size_of::<PlantState>() + 3 * size_of::<Heartbeat>()) as u64
+pub(crate) const NEEDED: u64 = room::<PlantState>(Channel::State)
+    + room::<Command>(Channel::Command)
+    + 3 * room::<Heartbeat>(Channel::Heartbeat(Role::Plant))
     + (256 << 10);
+
+/// The messages of a channel, bytes: as many as all its subscribers may keep and hold at a time.
+const fn room<T>(channel: Channel) -> u64 {
+    let of_one = channel.buffer_size() + MOST_BORROWED;
+    ((channel.max_subscribers() * of_one + ON_THEIR_WAY) * size_of::<T>()) as u64
+}
 
 /// Refuses a shared memory with less room than that. Where there is none to ask, nothing is refused.
 pub(crate) fn check_free(needed: u64) -> Result<(), LinkError> {
