@@ -9,16 +9,18 @@
 //! the software's time of a cycle = least of the run's and of every pass over the tape
 //! ```
 //!
+//! Of a pass the time on the core counts, not the clock's: on a machine busy with other things a cycle is interrupted in every pass.
+//!
 //! A pass goes over the whole run, so that the computations of a cycle are far apart and a slow stretch of the machine meets another cycle in
 //! every pass. There are at least [`PASSES_LEAST`]; further ones, up to [`PASSES_MOST`], as long as there are cycles whose time would count
 //! against the software. The least can only fall, never below what the cycle needs.
 
 use std::thread::Builder;
 
-use delmpc_controller_process::clock::monotonic_ns;
 use delmpc_controller_process::controller_loop::Controller;
 use delmpc_controller_process::machine::bind_to_core;
 use delmpc_controller_process::stop::StopFlag;
+use delmpc_controller_process::usage::Usage;
 use delmpc_messages::Command;
 
 use crate::robot_controller::RobotController;
@@ -99,10 +101,10 @@ fn pass(setup: &Setup, tape: &Tape, stop: &StopFlag) -> Result<Option<(Vec<u64>,
         if stop.is_set() {
             return Ok(None);
         }
-        let begin_ns = monotonic_ns();
+        let before = Usage::now();
         controller.cycle(&input.state, input.now_ns, &mut command);
         controller.prepare();
-        times_ns.push(monotonic_ns() - begin_ns);
+        times_ns.push(Usage::now().since(&before).cpu_ns);
         different += u64::from(checksum(&command) != input.command);
     }
     Ok(Some((times_ns, different)))

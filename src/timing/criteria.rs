@@ -1,16 +1,21 @@
 //! The thresholds of the scenario, kept or broken.
+//!
+//! Shares of misses and high percentiles are those of a sample: beyond its limit such a threshold is called broken when chance would hardly
+//! have put so many misses or times there ([`chance`]). The note beside it says what was counted.
 
 use delmpc_scenario::TimingSettings;
 use serde::Serialize;
 
+use crate::timing::chance::{self, SIGNIFICANCE};
+use crate::timing::figures::Times;
 use crate::timing::phases::{FloorFigures, LoopFigures, Quantity};
 use crate::timing::transport::TransportReport;
 
-/// Chance of calling a share of misses too large that is not.
-const SIGNIFICANCE: f64 = 0.05;
+/// Part of the cycles that may compute longer than the spread allows.
+const SPREAD_REST: f64 = 0.001;
 
-/// Latencies below this cannot be measured (s): the clock counts nanoseconds.
-const LEAST_LATENCY_S: f64 = 1e-9;
+/// Latencies below this cannot be measured (ns): the clock counts nanoseconds.
+const LEAST_LATENCY_NS: u64 = 1;
 
 /// One threshold.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -79,22 +84,15 @@ fn loop_criteria(
         )
     });
     if let Some(spread) = figures.compute_spread {
-        let note = match (&figures.again, figures.compute_spread_seen) {
+        let seen = match (&figures.again, figures.compute_spread_seen) {
             (Some(again), Some(seen)) => format!(
-                "least of {} computations of each cycle; of this one alone, where no disturbance was seen: {seen:.2}",
+                "least of {} computations of each cycle; of this one alone, where no disturbance was seen: {seen:.2}; ",
                 again.passes + 1
             ),
             _ => String::new(),
         };
-        list.push(Criterion {
-            note,
-            ..at_most(
-                "timing.compute_spread",
-                format!("{here}: cycle, 99.9 % over median, without the machine"),
-                spread,
-                settings.compute_spread,
-            )
-        });
+        let criterion = compute_spread(here, &figures.computing, spread, settings.compute_spread);
+        list.push(Criterion { note: seen + &criterion.note, ..criterion });
     }
     let same =
         |floor: &&FloorFigures| floor.loaded == figures.loaded && floor.core == measured.controller_core;
@@ -104,42 +102,24 @@ fn loop_criteria(
         let least_share = 1.0 / floor.deadlines.max(1) as f64;
         let of_floor = if machine == 0 { 0.0 } else { share / floor.missed_share().max(least_share) };
         let (loop_misses, floor_misses) = ((machine, figures.deadlines), (floor.missed, floor.deadlines));
-        let chance = chance_of_so_many(loop_misses, floor_misses, settings.misses_of_floor);
-        let within = of_floor <= settings.misses_of_floor;
-        let reason = match (within, chance >= SIGNIFICANCE) {
-            (false, true) => ", so nothing shows that it is not",
-            _ => "",
-        };
-        list.push(Criterion {
-            kept: within || chance >= SIGNIFICANCE,
-            note: format!(
-                "{machine} of {} deadlines, floor {} of {}; chance of so many if the limit were kept: {chance:.2}{reason}",
-                figures.deadlines,
-                floor.missed,
-                floor.deadlines
-            ),
-            ..at_most(
-                "timing.misses_of_floor",
-                format!("{here}: share of deadlines the machine broke, over the floor's"),
-                of_floor,
-                settings.misses_of_floor,
-            )
-        });
+        let counted = format!(
+            "{machine} of {} deadlines, floor {} of {}",
+            figures.deadlines, floor.missed, floor.deadlines
+        );
+        let criterion = at_most(
+            "timing.misses_of_floor",
+            format!("{here}: share of deadlines the machine broke, over the floor's"),
+            of_floor,
+            settings.misses_of_floor,
+        );
+        let chance = chance::of_so_many_misses(loop_misses, floor_misses, settings.misses_of_floor);
+        list.push(unless_by_chance(criterion, chance, &counted));
     }
     let p99 = |quantity: &Quantity| quantity.figures.map(|figures| figures.p99_s);
     let of = |key: &str| figures.quantities.iter().find(|quantity| quantity.key == key);
     let wake_up = of("wake_up").and_then(p99);
-    let idle = measured.idle.iter().find(same).and_then(|floor| p99(&floor.wake_up));
-    if let (Some(wake_up), Some(idle)) = (wake_up, idle) {
-        list.push(Criterion {
-            note: format!("{:.1} µs, floor {:.1} µs", 1e6 * wake_up, 1e6 * idle),
-            ..at_most(
-                "timing.wake_up_of_floor",
-                format!("{here}: wake-up latency, 99 %, over the floor's"),
-                wake_up / idle.max(LEAST_LATENCY_S),
-                settings.wake_up_of_floor,
-            )
-        });
+    if let Some(floor) = measured.idle.iter().find(same) {
+        list.extend(wake_up_of_floor(here, &figures.late, &floor.late, settings.wake_up_of_floor));
     }
     let absolute = [
         (
@@ -170,41 +150,56 @@ fn loop_criteria(
     list
 }
 
+/// Computing times: 99.9 % over the median.
+fn compute_spread(here: &str, computing: &Times, spread: f64, limit: f64) -> Criterion {
+    let criterion = at_most(
+        "timing.compute_spread",
+        format!("{here}: cycle, 99.9 % over median, without the machine"),
+        spread,
+        limit,
+    );
+    let longest_ns = limit * computing.at_ns(0.5).unwrap_or(0) as f64;
+    let (longer, cycles) = (computing.count_over(longest_ns as u64), computing.count());
+    let counted = format!("{longer} of {cycles} cycles longer than {limit} medians, 0.1 % may be");
+    unless_by_chance(criterion, chance::of_so_many(longer, cycles, SPREAD_REST), &counted)
+}
+
+/// Wake-up latencies of the loop and of the floor: 99 %, one over the other. `None` without a time.
+fn wake_up_of_floor(here: &str, late: &Times, floor: &Times, limit: f64) -> Option<Criterion> {
+    let (late_ns, floor_ns) = (late.at_ns(0.99)?, floor.at_ns(0.99)?);
+    let criterion = at_most(
+        "timing.wake_up_of_floor",
+        format!("{here}: wake-up latency, 99 %, over the floor's"),
+        late_ns as f64 / floor_ns.max(LEAST_LATENCY_NS) as f64,
+        limit,
+    );
+    // Were ours the floor's times the limit, as many would be longer as of the floor's own ones.
+    let longest_ns = (limit * floor_ns.max(LEAST_LATENCY_NS) as f64) as u64;
+    let (longer, rank) = (late.count_over(longest_ns), floor.count_from(floor_ns));
+    let counted = format!(
+        "{:.1} µs, floor {:.1} µs; {longer} of {} longer than the limit, floor {rank} of {} from its 99 % on",
+        1e-3 * late_ns as f64,
+        1e-3 * floor_ns as f64,
+        late.count(),
+        floor.count()
+    );
+    let chance = chance::of_so_many_longer(longer, late.count(), rank, floor.count());
+    Some(unless_by_chance(criterion, chance, &counted))
+}
+
+/// A threshold that is kept as well when what was counted may be chance.
+fn unless_by_chance(criterion: Criterion, chance: f64, counted: &str) -> Criterion {
+    let reason = match (criterion.kept, chance >= SIGNIFICANCE) {
+        (false, true) => ", so nothing shows that it is not",
+        _ => "",
+    };
+    let note = format!("{counted}; chance of so many if the limit were kept: {chance:.2}{reason}");
+    Criterion { kept: criterion.kept || chance >= SIGNIFICANCE, note, ..criterion }
+}
+
 /// NaN is not kept.
 fn at_most(key: &'static str, what: String, value: f64, limit: f64) -> Criterion {
     Criterion { key, what, value, limit, kept: value <= limit, note: String::new() }
-}
-
-/// Chance that the loop misses at least as many deadlines as it did when its share is `ratio` times the floor's.
-///
-/// Given both counts together, the loop's one is binomial. Source: Przyborowski, Wilenski, "Homogeneity of results in testing samples from
-/// Poisson series", Biometrika 31, 1940. Each argument: missed, of how many.
-fn chance_of_so_many(in_loop: (u64, u64), in_floor: (u64, u64), ratio: f64) -> f64 {
-    let (misses, cycles) = in_loop;
-    let (floor_misses, ticks) = in_floor;
-    let all = misses + floor_misses;
-    let weight = ratio * cycles as f64;
-    let part = weight / (weight + ticks as f64);
-    if misses == 0 || part >= 1.0 {
-        return 1.0;
-    }
-    if part.is_nan() || part <= 0.0 {
-        return 0.0;
-    }
-    // Terms of the binomial distribution from `misses` on, each from the one before.
-    let mut log_term = 0.0;
-    for k in 0..misses {
-        log_term += ((all - k) as f64 / (k + 1) as f64).ln();
-    }
-    log_term += misses as f64 * part.ln() + floor_misses as f64 * (1.0 - part).ln();
-    let mut sum = 0.0;
-    for k in misses..=all {
-        sum += log_term.exp();
-        if k < all {
-            log_term += ((all - k) as f64 / (k + 1) as f64).ln() + part.ln() - (1.0 - part).ln();
-        }
-    }
-    sum.min(1.0)
 }
 
 #[cfg(test)]
@@ -212,24 +207,50 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_chance_is_that_of_the_binomial_distribution() {
-        // One miss, none in the floor, equal lengths, ratio 1: half.
-        assert!((chance_of_so_many((1, 100), (0, 100), 1.0) - 0.5).abs() < 1e-12);
-        // Three of three: an eighth; two or more of three: a half.
-        assert!((chance_of_so_many((3, 100), (0, 100), 1.0) - 0.125).abs() < 1e-12);
-        assert!((chance_of_so_many((2, 100), (1, 100), 1.0) - 0.5).abs() < 1e-12);
-        // Twice allowed: (2/3)^10.
-        let chance = chance_of_so_many((10, 100), (0, 100), 2.0);
-        assert!((chance - (2.0_f64 / 3.0).powi(10)).abs() < 1e-12);
-        assert_eq!(chance_of_so_many((0, 100), (0, 100), 2.0), 1.0);
-        // Far from the limit on either side, with large counts.
-        assert!(chance_of_so_many((5000, 12_000), (1000, 12_000), 2.0) < 1e-12);
-        assert!(chance_of_so_many((1000, 12_000), (1000, 12_000), 2.0) > 1.0 - 1e-9);
-    }
-
-    #[test]
     fn a_threshold_is_kept_at_its_limit_and_broken_by_what_is_no_number() {
         let kept = |value| at_most("timing.compute_spread", String::new(), value, 1.5).kept;
         assert!(kept(1.5) && !kept(1.500_001) && !kept(f64::NAN));
+    }
+
+    #[test]
+    fn one_long_cycle_of_200_is_chance_and_two_are_not() {
+        let of = |long: usize, cycles: usize| {
+            let times = Times::of((0..cycles).map(|k| if k < long { 2_000_000 } else { 1_000_000 }));
+            let spread = times.at_ns(0.999).unwrap() as f64 / times.at_ns(0.5).unwrap() as f64;
+            compute_spread("alone", &times, spread, 1.5)
+        };
+        let (none, one, two) = (of(0, 200), of(1, 200), of(2, 200));
+        assert!(none.kept && none.value < 1.01 && !none.note.contains("nothing shows"), "{none:?}");
+        assert!(one.kept && one.value > 1.9, "{one:?}");
+        assert!(
+            one.note.contains("1 of 200 cycles") && one.note.contains("0.18, so nothing shows"),
+            "{one:?}"
+        );
+        assert!(!two.kept && two.note.contains("2 of 200 cycles"), "{two:?}");
+        // With many cycles 99.9 % is what it says: ten of 10 000 are within it, twenty are too many.
+        assert!(of(10, 10_000).kept && of(10, 10_000).value < 1.01);
+        assert!(!of(20, 10_000).kept);
+    }
+
+    #[test]
+    fn a_short_floor_shows_little_about_wake_ups_and_a_long_one_much() {
+        let late = |count: u64, long: u64| {
+            Times::of((0..count).map(move |k| if k < long { 1_000_000 } else { 10_000 + 20 * k }))
+        };
+        let of = |loop_late, floor| wake_up_of_floor("alone", &loop_late, &floor, 4.0).unwrap();
+        // Four per cent late by a millisecond: the longest of 51 says little about that, the 51 longest of 5000 do.
+        let short = of(late(200, 8), late(51, 0));
+        assert!(short.kept && short.value > 50.0, "{short:?}");
+        assert!(
+            short.note.contains("8 of 200 longer") && short.note.contains("so nothing shows"),
+            "{short:?}"
+        );
+        let long = of(late(200, 8), late(5000, 0));
+        assert!(!long.kept, "{long:?}");
+        // A tenth of all is too many beside any floor.
+        assert!(!of(late(200, 20), late(51, 0)).kept);
+        let within = of(late(200, 1), late(51, 0));
+        assert!(within.kept && within.value < 1.5 && !within.note.contains("nothing shows"), "{within:?}");
+        assert_eq!(wake_up_of_floor("alone", &late(0, 0), &late(51, 0), 4.0), None);
     }
 }

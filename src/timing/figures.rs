@@ -11,7 +11,7 @@ const SHORTEST_NS: f64 = 100.0;
 const BARS_PER_DECADE: f64 = 20.0;
 
 /// A collection of times.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Times {
     /// There is always one: only an impossible number of digits is refused.
     histogram: Option<Histogram<u64>>,
@@ -56,6 +56,18 @@ impl Times {
     pub fn at_ns(&self, part: f64) -> Option<u64> {
         let histogram = self.histogram.as_ref().filter(|histogram| !histogram.is_empty())?;
         Some(histogram.value_at_quantile(part))
+    }
+
+    /// How many are longer than this (ns), as far as the histogram can tell.
+    pub fn count_over(&self, time_ns: u64) -> u64 {
+        self.histogram.as_ref().map_or(0, |histogram| histogram.len() - histogram.count_between(0, time_ns))
+    }
+
+    /// How many are this long (ns) or longer, as far as the histogram can tell.
+    pub fn count_from(&self, time_ns: u64) -> u64 {
+        let Some(histogram) = &self.histogram else { return 0 };
+        let below = histogram.lowest_equivalent(time_ns).checked_sub(1);
+        histogram.len() - below.map_or(0, |below| histogram.count_between(0, below))
     }
 
     /// The figures; `None` without a time.
@@ -121,6 +133,10 @@ mod tests {
             assert!((value - expected).abs() <= 1e-3 * expected, "{value} {expected}");
         }
         assert_eq!(Times::of([]).figures(), None);
+        let times = Times::of([10, 20, 20, 30, 4000]);
+        assert_eq!([0, 10, 19, 20, 100, 9000].map(|time_ns| times.count_over(time_ns)), [5, 4, 4, 2, 1, 0]);
+        assert_eq!([0, 10, 11, 20, 100, 4001].map(|time_ns| times.count_from(time_ns)), [5, 5, 4, 4, 1, 1]);
+        assert_eq!((Times::of([]).count_over(0), Times::of([]).count_from(0)), (0, 0));
     }
 
     #[test]

@@ -12,12 +12,13 @@
 //! With `--faults` it runs every fault of a scenario instead ([`campaign`]).
 //!
 //! Files: [`floor`], [`co_load`], [`transport`] measure; [`loop_phase`] runs the processes, [`again`] computes their cycles again;
-//! [`attribution`] finds who missed a deadline; [`phases`] makes figures, [`mod@criteria`] judges, [`mod@table`] and [`pictures`] show. What the
+//! [`attribution`] finds who missed a deadline; [`phases`] makes figures, [`mod@criteria`] judges by what [`chance`] allows, [`mod@table`] and [`pictures`] show. What the
 //! operating system refuses is a warning, and the thresholds relative to the floor still hold.
 
 pub mod again;
 pub mod attribution;
 pub mod campaign;
+pub mod chance;
 pub mod co_load;
 pub mod criteria;
 pub mod figures;

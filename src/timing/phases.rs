@@ -16,7 +16,9 @@ use crate::timing::attribution::{
 };
 use crate::timing::co_load::{CoLoad, LoadDone};
 use crate::timing::figures::{Bar, Figures, Times};
-use crate::timing::floor::{FloorRun, FloorSettings, FloorThread, Work, deadlines, missed_deadlines, stalls};
+use crate::timing::floor::{
+    FloorRun, FloorSettings, FloorThread, FloorTick, Work, deadlines, missed_deadlines, stalls,
+};
 use crate::timing::loop_phase::{LoopRun, cores_of, run_loop};
 use crate::verdict::Failure;
 
@@ -57,6 +59,9 @@ pub struct FloorFigures {
     pub period_s: f64,
     /// Wake-up latency.
     pub wake_up: Quantity,
+    /// All its times.
+    #[serde(skip)]
+    pub late: Times,
     /// Ticks that were late by `event_s` or more.
     pub events: u64,
     /// Deadlines it had.
@@ -83,6 +88,12 @@ pub struct LoopFigures {
     pub fault: Option<String>,
     /// Cycles.
     pub cycles: u64,
+    /// Wake-up latencies of the controller.
+    #[serde(skip)]
+    pub late: Times,
+    /// The times that `compute_spread` is of.
+    #[serde(skip)]
+    pub computing: Times,
     /// All times.
     pub quantities: Vec<Quantity>,
     /// Wake-up latency of the witnesses of each core, and the time of their fixed work.
@@ -322,8 +333,9 @@ fn floor_figures(
     work_s: f64,
     loaded: bool,
 ) -> FloorFigures {
-    let late = || run.ticks.iter().map(|tick| tick.late_ns());
     let event_ns = ns(scenario.timing.event_s);
+    let events = run.ticks.iter().filter(|tick| tick.late_ns() >= event_ns).count() as u64;
+    let late = Times::of(run.ticks.iter().map(FloorTick::late_ns));
     let what = if work_s > 0.0 { "occupied" } else { "idle" };
     let with = if loaded { ", co-load" } else { "" };
     let name = format!("{what} thread, core {core}{with}");
@@ -332,8 +344,9 @@ fn floor_figures(
         loaded,
         work_s,
         period_s,
-        wake_up: Quantity::new("wake_up", &name, late()),
-        events: late().filter(|late| *late >= event_ns).count() as u64,
+        wake_up: Quantity::of("wake_up", &name, &late),
+        late,
+        events,
         deadlines: deadlines(&run.ticks),
         missed: missed_deadlines(&run.ticks, ns(period_s)),
         realtime: run.realtime,
@@ -372,15 +385,17 @@ fn loop_figures(
     misses.truncate(MISSES_KEPT);
     let disturbed = |account: &&Account| account.is_disturbed(event_ns);
     let calm = accounts.iter().filter(|account| !account.is_seen_disturbed(event_ns));
-    let spread_seen = spread(&Times::of(calm.map(Account::computing_ns)));
+    let seen = Times::of(calm.map(Account::computing_ns));
     let of_itself = Times::of(accounts.iter().map(Account::software_ns));
+    let computing = if again.is_some() { of_itself.clone() } else { seen.clone() };
+    let late = wake_ups(&accounts);
     let (plant, controller) = (run.summary.plant.as_ref(), run.summary.controller.as_ref());
     LoopFigures {
         loaded: load.is_some(),
         fault: (run.course != Course::Finished).then(|| run.summary.failure.clone()).flatten(),
         cycles: run.cycles.len() as u64,
         quantities: [
-            controller_quantities(&run.cycles, &accounts, period_ns),
+            controller_quantities(&run.cycles, &accounts, &late, period_ns),
             plant_quantities(&run.steps, ns(scenario.plant.step_s)),
         ]
         .concat(),
@@ -404,9 +419,11 @@ fn loop_figures(
                 ]
             })
             .collect(),
+        late,
         disturbed_cycles: accounts.iter().filter(disturbed).count() as u64,
-        compute_spread: if again.is_some() { spread(&of_itself) } else { spread_seen },
-        compute_spread_seen: spread_seen,
+        compute_spread: spread(&computing),
+        computing,
+        compute_spread_seen: spread(&seen),
         again: again.map(|again| AgainFigures {
             passes: again.passes,
             least: Quantity::of(
@@ -451,11 +468,19 @@ fn software_share_of_jitter(accounts: &[Account], median_ns: u64) -> f64 {
     if software + machine > 0.0 { software / (software + machine) } else { 0.0 }
 }
 
-fn controller_quantities(cycles: &[CycleRecord], accounts: &[Account], period_ns: u64) -> Vec<Quantity> {
+fn wake_ups(accounts: &[Account]) -> Times {
     // Who was still at work at the tick was not woken up.
     let woken = accounts.iter().filter(|account| account.backlog_ns == 0);
-    let late = woken.map(|account| account.late_ns);
-    let mut list = vec![Quantity::new("wake_up", "controller: wake-up latency", late)];
+    Times::of(woken.map(|account| account.late_ns))
+}
+
+fn controller_quantities(
+    cycles: &[CycleRecord],
+    accounts: &[Account],
+    late: &Times,
+    period_ns: u64,
+) -> Vec<Quantity> {
+    let mut list = vec![Quantity::of("wake_up", "controller: wake-up latency", late)];
     for stage in Stage::ALL {
         let key = format!("stage_{stage:?}").to_lowercase();
         let name = format!("controller: {}", stage.name());
