@@ -7,6 +7,7 @@
 use alloc::vec;
 use alloc::vec::Vec;
 
+use delmpc_horizon::hermite::Hermite;
 use delmpc_mechanics::inverse_dynamics::{InverseDynamicsWorkspace, gravity_force_into};
 use delmpc_mechanics::spatial::{exp_rotation, log_rotation};
 use nalgebra::Vector3;
@@ -131,60 +132,19 @@ impl PlannedMotion {
         let (a, b) = (&self.nodes[k - 1], &self.nodes[k]);
         let length = b.time_s - a.time_s;
         let t = ((time_s - a.time_s) / length).clamp(0.0, 1.0);
-        let hermite = Hermite::new(t, length);
+        let cubic = Hermite::new(t, length);
         for (j, (posture, rate)) in targets.posture.iter_mut().zip(&mut targets.posture_rate).enumerate() {
-            (*posture, *rate) = hermite.scalar((a.at.q[j], a.rate[j]), (b.at.q[j], b.rate[j]));
+            let ends = ((a.at.q[j], a.rate[j]), (b.at.q[j], b.rate[j]));
+            (*posture, *rate) = (cubic.value(ends), cubic.rate(ends));
         }
-        (targets.com, targets.com_velocity) =
-            hermite.point((&a.at.com, &a.com_velocity), (&b.at.com, &b.com_velocity));
-        (targets.hand, targets.hand_velocity) =
-            hermite.point((&a.at.hand, &a.hand_velocity), (&b.at.hand, &b.hand_velocity));
-        let (from, to) =
-            ((&a.at.swing_foot, &a.swing_foot_velocity), (&b.at.swing_foot, &b.swing_foot_velocity));
-        targets.swing_foot = hermite.point(from, to).0;
+        let com = ((a.at.com, a.com_velocity), (b.at.com, b.com_velocity));
+        (targets.com, targets.com_velocity) = (cubic.value(com), cubic.rate(com));
+        let hand = ((a.at.hand, a.hand_velocity), (b.at.hand, b.hand_velocity));
+        (targets.hand, targets.hand_velocity) = (cubic.value(hand), cubic.rate(hand));
+        let foot = |node: &Node| (node.at.swing_foot, node.swing_foot_velocity);
+        targets.swing_foot = cubic.value((foot(a), foot(b)));
         let (from, to) = (&a.at.swing_foot_rotation, &b.at.swing_foot_rotation);
         targets.swing_foot_rotation = from * exp_rotation(&(log_rotation(&from.tr_mul(to)) * t));
-    }
-}
-
-/// The cubic Hermite polynomial at one place of an interval.
-struct Hermite {
-    /// Weights of the value: of both positions, of both rates.
-    value: [f64; 4],
-    /// Weights of the rate.
-    rate: [f64; 4],
-}
-
-impl Hermite {
-    /// At the part `t` of an interval of `length` s.
-    fn new(t: f64, length: f64) -> Self {
-        let (t2, t3) = (t * t, t * t * t);
-        let slope = 6.0 * (t2 - t) / length;
-        Self {
-            value: [
-                1.0 - 3.0 * t2 + 2.0 * t3,
-                3.0 * t2 - 2.0 * t3,
-                length * (t - 2.0 * t2 + t3),
-                length * (t3 - t2),
-            ],
-            rate: [slope, -slope, 1.0 - 4.0 * t + 3.0 * t2, 3.0 * t2 - 2.0 * t],
-        }
-    }
-
-    /// Value and rate from those at both ends.
-    fn scalar(&self, a: (f64, f64), b: (f64, f64)) -> (f64, f64) {
-        let sum = |w: &[f64; 4]| w[0] * a.0 + w[1] * b.0 + w[2] * a.1 + w[3] * b.1;
-        (sum(&self.value), sum(&self.rate))
-    }
-
-    /// The same for points.
-    fn point(
-        &self,
-        a: (&Vector3<f64>, &Vector3<f64>),
-        b: (&Vector3<f64>, &Vector3<f64>),
-    ) -> (Vector3<f64>, Vector3<f64>) {
-        let sum = |w: &[f64; 4]| a.0 * w[0] + b.0 * w[1] + a.1 * w[2] + b.1 * w[3];
-        (sum(&self.value), sum(&self.rate))
     }
 }
 
@@ -209,19 +169,6 @@ impl JointMotion {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_cubic_is_followed_exactly_between_its_times() {
-        let value = |t: f64| 0.3 * t * t * t - t + 0.2;
-        let slope = |t: f64| 0.9 * t * t - 1.0;
-        for (a, b) in [(0.0, 0.1), (0.4, 0.9)] {
-            for part in [0.0, 0.3, 0.77, 1.0] {
-                let t: f64 = a + part * (b - a);
-                let (q, rate) = Hermite::new(part, b - a).scalar((value(a), slope(a)), (value(b), slope(b)));
-                assert!((q - value(t)).abs() < 1e-14 && (rate - slope(t)).abs() < 1e-13, "{q} {rate}");
-            }
-        }
-    }
 
     #[test]
     fn joints_change_their_order_and_a_missing_one_is_refused() {

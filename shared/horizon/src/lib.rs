@@ -10,7 +10,7 @@
 //! |---|---|---|
 //! | robot | [`legged_model`], [`limits`] | floating tree, feet, limits, posture |
 //! | when and where | [`contact_schedule`], [`gait`], [`step_plan`], [`retiming`], [`ground_plane`], [`stage_grid`] | stances of every foot, switch times as stage boundaries |
-//! | aim | [`base_path`], [`mass_centre_plan`], [`planned_base`], [`leg_kinematics`], [`load_sharing`], [`motion_reference`] | where base and feet shall be, and which forces carry that |
+//! | aim | [`base_path`], [`mass_centre_plan`], [`planned_base`], [`hermite`], [`leg_kinematics`], [`load_sharing`], [`motion_reference`] | where base and feet shall be, and which forces carry that |
 //! | stage | [`foot_cone`], [`motion_plan`], [`legged_tasks`], [`legged_problem`] | wrench rows, the nominal, costs and transitions |
 //!
 //! A stage has a contact set of its own: none, points, flat feet; the mechanics of it are those of
@@ -32,6 +32,7 @@ pub mod errors;
 pub mod foot_cone;
 pub mod gait;
 pub mod ground_plane;
+pub mod hermite;
 pub mod leg_kinematics;
 pub mod legged_model;
 pub mod legged_problem;

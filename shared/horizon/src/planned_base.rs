@@ -12,6 +12,8 @@ use alloc::vec::Vec;
 use delmpc_mechanics::spatial::{exp_rotation, log_rotation};
 use nalgebra::{Matrix3, Vector3};
 
+use crate::hermite::Hermite;
+
 /// Base, mass centre and joints at a boundary of the plan.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BaseNode {
@@ -78,15 +80,14 @@ impl PlannedBase {
             Between::Rest(node) => return resting(node),
             Between::Nodes(a, b) => (a, b),
         };
-        let length = b.time_s - a.time_s;
-        let t = (time_s - a.time_s) / length;
+        let cubic = a.cubic_to(b, time_s);
+        let still = Vector3::zeros();
         let turn = log_rotation(&a.orientation.tr_mul(&b.orientation));
-        let [angle, spin, _] = hermite(t, length, [&Vector3::zeros(), &a.spin_b, &turn, &b.spin_b]);
-        let ends = [&a.mass_centre_w, &a.mass_centre_velocity_w, &b.mass_centre_w, &b.mass_centre_velocity_w];
+        let (turning, way) = (((still, a.spin_b), (turn, b.spin_b)), (a.way(), b.way()));
         BasePoint {
-            mass_centre_w: hermite(t, length, ends),
-            orientation: a.orientation * exp_rotation(&angle),
-            spin_b: spin,
+            mass_centre_w: [cubic.value(way), cubic.rate(way), cubic.change(way)],
+            orientation: a.orientation * exp_rotation(&cubic.value(turning)),
+            spin_b: cubic.rate(turning),
         }
     }
 }
@@ -114,30 +115,24 @@ impl PlannedBase {
         match self.between(time_s) {
             Between::Rest(node) => q.copy_from_slice(&node.q),
             Between::Nodes(a, b) => {
-                let length = b.time_s - a.time_s;
-                let t = (time_s - a.time_s) / length;
-                let (t2, t3) = (t * t, t * t * t);
+                let cubic = a.cubic_to(b, time_s);
                 for (j, q) in q.iter_mut().enumerate() {
-                    *q = a.q[j] * (1.0 - 3.0 * t2 + 2.0 * t3)
-                        + b.q[j] * (3.0 * t2 - 2.0 * t3)
-                        + (a.rate[j] * (t - 2.0 * t2 + t3) + b.rate[j] * (t3 - t2)) * length;
+                    *q = cubic.value(((a.q[j], a.rate[j]), (b.q[j], b.rate[j])));
                 }
             }
         }
     }
 }
 
-/// Value, rate and change of rate at the part `t` of `length` seconds, from value and rate at both ends.
-fn hermite(t: f64, length: f64, [p, v, q, w]: [&Vector3<f64>; 4]) -> [Vector3<f64>; 3] {
-    let (t2, t3) = (t * t, t * t * t);
-    let value = p * (1.0 - 3.0 * t2 + 2.0 * t3)
-        + q * (3.0 * t2 - 2.0 * t3)
-        + (v * (t - 2.0 * t2 + t3) + w * (t3 - t2)) * length;
-    let rate =
-        (p - q) * (6.0 * (t2 - t) / length) + v * (1.0 - 4.0 * t + 3.0 * t2) + w * (3.0 * t2 - 2.0 * t);
-    let change = (p - q) * ((12.0 * t - 6.0) / (length * length))
-        + (v * (6.0 * t - 4.0) + w * (6.0 * t - 2.0)) / length;
-    [value, rate, change]
+impl BaseNode {
+    fn way(&self) -> (Vector3<f64>, Vector3<f64>) {
+        (self.mass_centre_w, self.mass_centre_velocity_w)
+    }
+
+    fn cubic_to(&self, next: &Self, time_s: f64) -> Hermite {
+        let length = next.time_s - self.time_s;
+        Hermite::new((time_s - self.time_s) / length, length)
+    }
 }
 
 #[cfg(test)]
