@@ -2,10 +2,10 @@
 
 use std::cell::RefCell;
 
+use delmpc_controller_core::prelude::*;
 use delmpc_lq::active_set_dual::ActiveSetDual;
 use delmpc_lq::clarabel_dual::ClarabelDual;
 use delmpc_lq::dual_qp::{QpSolver, dual_residual};
-use delmpc_controller_core::prelude::*;
 use delmpc_mechanics::prelude::*;
 use delmpc_messages::PlantState;
 use faer::Mat;

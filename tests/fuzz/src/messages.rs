@@ -4,7 +4,9 @@ use bytemuck::Zeroable;
 use delmpc::log::{read_command, read_record};
 use delmpc::log_reader::{Item, LogReader};
 use delmpc::truth::Truth;
-use delmpc_messages::{Command, FallbackLevel, Heartbeat, MAX_JOINTS, PlantState};
+use delmpc_messages::{
+    Command, FallbackLevel, FootReading, Heartbeat, MAX_JOINTS, PlantState, ServoReadings,
+};
 use delmpc_servo::servo::{Servo, WatchdogConfig};
 
 use crate::numbers::Numbers;
@@ -69,7 +71,14 @@ fn good(sequence: u64, now_ns: u64) -> Command {
 pub fn messages(data: &[u8]) {
     let mut numbers = Numbers(data);
     let Ok(mut servo) = Servo::new(JOINTS, HASH, WatchdogConfig::default()) else { return };
-    let mut torque = [0.0; JOINTS];
+    let mut torque = [0.0_f64; JOINTS];
+    let feet = [FootReading { force_s: [1.0, 2.0, 300.0], ..FootReading::zeroed() }; 2];
+    // All that a servo may read, so that every term of the law is computed.
+    let readings = ServoReadings {
+        imu: Some(([0.1; 3], [0.2; 3])),
+        feet: &feet,
+        ..ServoReadings::joints(&[0.1; JOINTS], &[0.2; JOINTS])
+    };
     let mut now_ns = 0;
     for _ in 0..16 {
         if numbers.is_over() {
@@ -79,14 +88,14 @@ pub fn messages(data: &[u8]) {
         let taken = servo.accept(&hostile, now_ns).is_ok();
         assert!(!taken || hostile.validate(HASH, JOINTS).is_ok());
         for later_ns in [0, MS, 9 * MS] {
-            servo.torque_into(now_ns + later_ns, &[0.1; JOINTS], &[0.2; JOINTS], &mut torque);
+            servo.torque_into(now_ns + later_ns, &readings, &mut torque);
             assert!(torque.iter().all(|torque| torque.is_finite()), "a torque that is no number");
         }
         now_ns += 10 * MS;
         // What a controller that hears the plant sends next.
         let next = good(servo.applied_sequence() + 1, now_ns);
         servo.accept(&next, now_ns).expect("the next good command is taken");
-        servo.torque_into(now_ns, &[0.0; JOINTS], &[0.0; JOINTS], &mut torque);
+        servo.torque_into(now_ns, &readings, &mut torque);
         assert_eq!(servo.applied_sequence(), next.header.sequence, "the next good command acts");
         now_ns += MS;
 
@@ -98,7 +107,8 @@ pub fn messages(data: &[u8]) {
         let _ = hostile.is_valid_at(numbers.word());
         let slices = [[0.1; MAX_JOINTS]; 2];
         let n = (hostile.n_joints as usize).min(MAX_JOINTS);
-        let _ = hostile.torque_into(now_ns, &slices[0][..n], &slices[1][..n], &mut [0.0; MAX_JOINTS][..n]);
+        let joints = ServoReadings { position: &slices[0][..n], velocity: &slices[1][..n], ..readings };
+        let _ = hostile.torque_into(now_ns, &joints, &mut [0.0; MAX_JOINTS][..n]);
         let _ = damaged(Heartbeat::zeroed(), &mut numbers).validate(HASH);
     }
     let mut packed = Vec::new();
