@@ -101,15 +101,14 @@ impl Aim {
 }
 
 impl Aim {
-    /// Orientation of the base at a time, and its angular velocity in its axes; `upright`: orientation at home without its heading.
-    fn orientation_at(&self, time_s: f64, upright: &Matrix3<f64>) -> (Matrix3<f64>, Vector3<f64>) {
+    /// How the base is turned at a time from its orientation at home without its heading, `upright`; and its angular velocity.
+    fn turn_at(&self, time_s: f64, upright: &Matrix3<f64>) -> (Matrix3<f64>, Vector3<f64>) {
         if let Some(planned) = &self.planned {
             let point = planned.at(time_s);
-            return (point.orientation, point.spin_b);
+            return (point.orientation * upright.transpose(), point.orientation * point.spin_b);
         }
         let point = self.path.at(time_s);
-        let orientation = rotation_z(point.yaw) * upright;
-        (orientation, orientation.tr_mul(&Vector3::new(0.0, 0.0, point.yaw_rate)))
+        (rotation_z(point.yaw), Vector3::new(0.0, 0.0, point.yaw_rate))
     }
 }
 
@@ -245,7 +244,7 @@ impl MotionReference {
     ) -> Result<(), HorizonError> {
         self.kinematics.update(&model.tree, state)?;
         let [place, ..] = self.aim.mass_centre_at(time_s);
-        let (aimed, _) = self.aim.orientation_at(time_s, &self.upright);
+        let aimed = self.aim.turn_at(time_s, &self.upright).0 * self.upright;
         self.begin = Begin {
             time_s,
             turn: log_rotation(&aimed.tr_mul(&state.orientation)),
@@ -338,13 +337,13 @@ impl MotionReference {
     ) -> Result<(), StepError> {
         let Self { aim, swing, legs, targets, upright, to_mass_centre, begin, .. } = self;
         let target = &mut targets[k];
-        let (aimed, spin) = aim.orientation_at(time_s, upright);
+        let (turn, spin_w) = aim.turn_at(time_s, upright);
         let [place, velocity, _] = aim.mass_centre_at(time_s);
         let left = begin.left(time_s);
         let place = place + begin.way * left;
         (target.mass_centre_w, target.mass_centre_velocity_w) = (place, velocity);
-        target.state.orientation = aimed * exp_rotation(&(begin.turn * left));
-        target.state.position_w = place - aimed * upright.tr_mul(to_mass_centre);
+        target.state.orientation = turn * *upright * exp_rotation(&(begin.turn * left));
+        target.state.position_w = place - turn * *to_mass_centre;
         for (foot, out) in target.feet.iter_mut().enumerate() {
             // At its touchdown a foot is still where its swing ends.
             *out = match schedule.phase(foot, time_s - BEFORE_S) {
@@ -361,7 +360,7 @@ impl MotionReference {
             legs.solve(model, &pose, &target.feet, &mut target.state.q, ITERATIONS)?;
             target.state.position_w += place - legs.mass_centre_w(model);
         }
-        let spin = exp_rotation(&(begin.turn * left)).tr_mul(&spin);
+        let spin = target.state.orientation.tr_mul(&spin_w);
         let linear = target.state.orientation.tr_mul(&velocity);
         target.state.base_velocity_b = Vector6::new(spin.x, spin.y, spin.z, linear.x, linear.y, linear.z);
         Ok(())
