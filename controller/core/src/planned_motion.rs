@@ -15,11 +15,12 @@ use nalgebra::Vector3;
 use crate::errors::ControlError;
 use crate::model::ControllerModel;
 use crate::node_kinematics::NodeKinematics;
-use crate::posture_goal::posture_goal;
+use crate::posture_goal::goal_at;
 use crate::reference::PostureGoal;
 use crate::tasks::TaskTargets;
 
-/// Joint positions and rates at times from 0 on, in the order of the controller's joints.
+/// Joint positions and rates at times from 0 on, and the torques between them, in the order of the controller's joints: `N + 1` times,
+/// positions and rates, `N` torques, a row of all joints each.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct JointMotion {
     /// Times, from 0, s.
@@ -83,7 +84,7 @@ impl PlannedMotion {
             };
             nodes.push(Node {
                 time_s: *time_s,
-                at: posture_goal(model, q)?,
+                at: goal_at(model, &kinematics, q),
                 rate: rate.clone(),
                 com_velocity: kinematics.com_velocity(),
                 hand_velocity: velocity(model.hand),

@@ -35,17 +35,22 @@ pub fn posture_goal(model: &ControllerModel, q: &[f64]) -> Result<PostureGoal, M
     let tree = &model.tree;
     let mut node = NodeKinematics::new(tree);
     node.update(tree, q, &vec![0.0; tree.dof()])?;
+    Ok(goal_at(model, &node, q))
+}
+
+/// The same where the kinematics of `q` are known.
+pub(crate) fn goal_at(model: &ControllerModel, node: &NodeKinematics, q: &[f64]) -> PostureGoal {
     let point = |p: Option<crate::model::BodyPoint>| {
         p.map_or_else(Vector3::zeros, |p| node.point(p.body, &p.position).0)
     };
     let rotation = model.swing_foot.map_or_else(Matrix3::identity, |p| node.link_pose_w(p.body).rotation);
-    Ok(PostureGoal {
+    PostureGoal {
         q: q.to_vec(),
         com: node.com(),
         hand: point(model.hand),
         swing_foot: point(model.swing_foot),
         swing_foot_rotation: rotation,
-    })
+    }
 }
 
 /// The balanced posture nearest to `home` with the hand at `ball`.
