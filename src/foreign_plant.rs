@@ -96,14 +96,14 @@ impl Drop for Listener {
 /// The oldest message of each kind that was heard and not taken yet.
 #[derive(Default)]
 struct Heard {
-    truth: Option<Box<PlantState>>,
-    state: Option<Box<PlantState>>,
-    command: Option<Box<Command>>,
+    truth: Option<PlantState>,
+    state: Option<PlantState>,
+    command: Option<Command>,
 }
 
-fn hear<T: Payload>(held: &mut Option<Box<T>>, from: &mut SharedSubscriber<T>) -> Result<(), Failure> {
+fn hear<T: Payload>(held: &mut Option<T>, from: &mut SharedSubscriber<T>) -> Result<(), Failure> {
     if held.is_none() {
-        *held = from.receive_next().map_err(Failure::fault)?.map(|message| Box::new(*message));
+        *held = from.receive_next().map_err(Failure::fault)?.copied();
     }
     Ok(())
 }
